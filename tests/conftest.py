@@ -12,6 +12,8 @@ import pytest
 if "PACE_TEST_STATE" not in os.environ:  # processes that tests start share it
     os.environ["PACE_TEST_STATE"] = os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="pace-state-")
     atexit.register(shutil.rmtree, os.environ["XDG_STATE_HOME"], ignore_errors=True)
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # each core has a process of its own
+        os.environ.setdefault(name, "1")
 
 from warm_python import WarmPython, warm_python
 

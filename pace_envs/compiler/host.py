@@ -22,8 +22,9 @@ import torch
 from pace_actuators.files import OwnFolder
 
 _COMPILERS = ("c++", "g++", "clang++")
-_OPTIONS = ("-O2", "-ffp-contract=off", "-fno-math-errno", "-shared", "-fPIC", "-x", "c++")
-"""A multiplication and an addition are rounded one by one, as everywhere else."""
+_OPTIONS = ("-O2", "-ffp-contract=off", "-fno-math-errno", "-nostdinc++", "-shared", "-fPIC", "-x", "c++")
+"""A multiplication and an addition are rounded one by one, as everywhere else. Headers are C's alone: to read those of
+C++ takes as long as to compile a kernel."""
 _PATIENCE = 3000
 """Steps in Python that take as long as a compiler."""
 _LONGEST_S = 180.0

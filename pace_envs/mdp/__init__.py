@@ -9,7 +9,6 @@ from pace_envs.mdp.actions import (
     JointVelocityActionCfg,
 )
 from pace_envs.mdp.commands import UniformVelocityCommand, UniformVelocityCommandCfg
-from pace_envs.mdp.contact_rewards import feet_air_time, feet_slide, undesired_contacts
 from pace_envs.mdp.curriculums import command_range_by_tracking
 from pace_envs.mdp.energy import electrical_power, motor_power
 from pace_envs.mdp.events import push_by_setting_velocity, reset_joints_by_offset, reset_root_state_uniform
@@ -29,6 +28,8 @@ from pace_envs.mdp.randomization import randomize_body_mass, randomize_friction
 from pace_envs.mdp.rewards import (
     action_rate_l2,
     ang_vel_xy_l2,
+    feet_air_time,
+    feet_slide,
     flat_orientation_l2,
     is_alive,
     joint_acc_l2,
@@ -37,6 +38,7 @@ from pace_envs.mdp.rewards import (
     track_ang_vel_z_exp,
     track_lin_vel_xy_exp,
     track_velocity_exp,
+    undesired_contacts,
 )
 from pace_envs.mdp.terminations import (
     bad_orientation,

@@ -21,7 +21,7 @@ from pace_optim.run.result import FitResult
 from pace_optim.run.settings import FitSettings
 from pace_optim.run.tensors import read_trajectory
 
-from .load_torque import load_torques
+from .drive_loads import load_torques
 
 _SAME = 1e-9
 

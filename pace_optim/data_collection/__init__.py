@@ -7,9 +7,8 @@
 from .cfg import CollectionCfg
 from .collect import Collection, collect
 from .command_line import cfg_from_args, make_collection_parser
-from .encoder import Encoder
 from .plot import plot_motion
-from .simulate import Simulated, simulate
+from .simulate import Encoder, Simulated, simulate
 from .truth import true_parameters
 
 __all__ = [

@@ -30,11 +30,10 @@ from pace_optim.recording import save_recording
 
 from .cfg import CollectionCfg
 from .design import design_motion
-from .encoder import Encoder
 from .files import Files, plan_files, truth_file
 from .hidden import Hidden, simulate_hidden
 from .plot import plot_motion
-from .simulate import Simulated, simulate
+from .simulate import Encoder, Simulated, simulate
 from .speeds import driven_by_speed, told_speeds
 from .truth import true_parameters
 

@@ -16,7 +16,7 @@ from pace_optim.estimate.comb_scan import scanned
 from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
 from pace_optim.estimate.error_bars.loop_rate import UNEXPLAINED
-from pace_optim.estimate.error_bars.torque_noise import torque_noise
+from pace_optim.estimate.error_bars.uncertainty import torque_noise
 from pace_optim.estimate.error_bars.undetermined import at_prior
 from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg
 from pace_optim.estimate.search import agree_to_stop, search

@@ -9,6 +9,8 @@ from typing import Any
 
 import torch
 
+from pace_actuators.memory import check_memory
+from pace_envs.simulation import bytes_per_env
 from pace_optim.estimate.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
 from pace_optim.estimate.convergence import stop_rule
 from pace_optim.estimate.own_objective import Objective, build, optimizer_class
@@ -17,7 +19,6 @@ from pace_optim.identification.log_checks import checked
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.recordings import tell_on_stderr
-from pace_optim.problem.try_out import check_size, try_out
 from pace_optim.run.open import problem_of
 from pace_optim.run.settings import FitSettings
 from pace_optim.terminal.processes import Processes
@@ -123,3 +124,50 @@ def make_searcher(problem: Problem, settings: FitSettings) -> Evaluator:
     if settings.optimizer == "hybrid":
         problem = problem.on_pieces(WayDownCfg().share)
     return problem.training_evaluator()
+
+
+_TRIED_STEPS = 4
+"""Control steps that a candidate is tried out for."""
+
+_BYTES_PER_VALUE = 100
+"""Memory of a search for each parameter of a candidate: its scores, its ranks and copies of it [bytes]."""
+
+
+def try_out(problem: Problem) -> None:
+    """Simulate one candidate on each recording for some steps: what cannot be applied fails before anything is kept.
+
+    Raises:
+        ValueError: If the motion is not finite; an effect that makes it so alone is named.
+    """
+    if _stays_finite(problem):
+        return
+    guilty = [label for label in problem.effects if not _stays_finite(problem.with_effects([label]))]
+    raise ValueError(
+        f"The simulation is not finite within {_TRIED_STEPS} steps from the start"
+        + (f" with the effect {guilty[0]}. Correct the effect." if guilty else ". Check the model, gains and bounds.")
+    )
+
+
+def check_size(problem: Problem, simulated: int, num_envs: int) -> None:
+    """Refuse a search for which there is no memory, before the run has a folder.
+
+    Args:
+        problem: What is fitted.
+        simulated: How many simulations the search makes at once.
+        num_envs: How many were asked for.
+
+    Raises:
+        ValueError: If there is too little.
+    """
+    env = problem.make_env(1)
+    each = bytes_per_env(env.sim.model) + _BYTES_PER_VALUE * problem.space.size
+    env.close()
+    check_memory(simulated * each, f"--num_envs {num_envs}", "Take fewer: a search gains little beyond 4096.")
+
+
+def _stays_finite(problem: Problem) -> bool:
+    rollout = problem.evaluator().rollout(1)
+    rollout.start(problem.space.to_physical(problem.space.start[None]))
+    finite = all(bool(position.isfinite().all()) for position in rollout.simulated(_TRIED_STEPS))
+    rollout.env.close()
+    return finite

@@ -18,10 +18,9 @@ from pace_envs.motor_coordinates import joint_ranges
 from pace_optim.problem.drive_steps import of_joints
 from pace_optim.recording import Recording, conform_recording
 from pace_optim.recording.commands import command_interval
-from pace_optim.recording.conform import with_columns
+from pace_optim.recording.conform import of_motors, with_columns
 from pace_optim.recording.gaps import split_at_gaps
 from pace_optim.recording.logs import Robot, load_recordings, paired_files, read_map, with_rate
-from pace_optim.recording.motors import of_motors
 
 if TYPE_CHECKING:
     from pace_envs import ManagerBasedEnv

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+
+from pace_actuators.text import listed
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -240,3 +243,28 @@ def validation_start(recording: Recording, fraction: float = 0.7) -> int:
 
 def _has_values(series: np.ndarray | None, num_joints: int) -> np.ndarray:
     return np.zeros(num_joints, dtype=bool) if series is None else ~np.isnan(series).all(axis=0)
+
+
+_NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
+
+
+def notes_by_kind(recordings: Sequence[Recording]) -> list[str]:
+    """Notes with the recordings that have them; those that differ in numbers alone come once, of the first.
+
+    Args:
+        recordings: In the order of the notes.
+    """
+    kinds: dict[str, list[tuple[str, str]]] = {}
+    for recording in recordings:
+        for note in recording.notes:
+            kinds.setdefault(_NUMBER.sub("#", note), []).append((recording.name, note))
+    result = []
+    for told in kinds.values():
+        (first, note), names = told[0], dict.fromkeys(name for name, _ in told)
+        if len({text for _, text in told}) == 1:
+            result.append(f"{listed(names, 6)}: {note}")
+        else:
+            others = [name for name in names if name != first]
+            more = f" ({listed(others, 5)}: the same with other numbers.)" if others else ""
+            result.append(f"{first}: {note}{more}")
+    return result

@@ -25,8 +25,8 @@ from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.unknown_facts import identified_gains, identified_limits
 from pace_optim.recording.commands import command_timing
+from pace_optim.recording.data import notes_by_kind
 from pace_optim.recording.dataset import Torques
-from pace_optim.recording.notes import notes_by_kind
 
 
 @dataclass(kw_only=True)

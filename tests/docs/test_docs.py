@@ -1,5 +1,6 @@
 """The tutorials work when typed: their blocks of bash and Python run, in order, in one shell."""
 
+import json
 import os
 import re
 import shutil
@@ -85,6 +86,19 @@ def test_the_tutorial_for_a_walking_robot_works_when_typed(warm, tmp_path):
 def test_the_page_for_users_of_pace_works_when_typed(warm, tmp_path):
     printed = type_in(warm, ROOT / "docs" / "coming_from_pace.md", tmp_path, ROOT)
     assert "plot: " in printed and "objective my_optimizers:Weighted" in printed
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_the_notebook_runs_from_top_to_bottom(warm, tmp_path):
+    cells = json.loads((ROOT / "docs" / "demo.ipynb").read_text("utf-8"))["cells"]
+    assert not any(cell.get("outputs") for cell in cells), "outputs stay out of the repository"
+    code = "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+    guarded = "if __name__ == '__main__':\n" + "\n".join(f"    {line}" for line in code.splitlines())
+    (tmp_path / "notebook.py").write_text(guarded, encoding="utf-8")
+    run = warm.run("notebook.py", cwd=tmp_path, timeout=580)
+    assert run.returncode == 0, run.stderr[-3000:]
+    assert "stribeck_friction" in run.stdout
 
 
 def test_the_page_of_effects_is_that_of_the_registry():

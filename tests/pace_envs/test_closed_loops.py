@@ -10,7 +10,7 @@ from models import FINGER, FOUR_BAR
 
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.from_model import cfg_from_model
-from pace_envs.from_model.rest import at_rest
+from pace_envs.from_model.robot import at_rest
 from pace_optim.problem.kinematic_trees import independent_trees
 from pace_optim.problem.log_and_robot import refuse_open_loops
 from pace_optim.recording import Recording

@@ -91,41 +91,52 @@ def write_rows(bench, values):
             bench.robot._write_model(actuator, effect)
 
 
+def all_corners(names, bases):
+    """Rows on which effects have all corners of their bounds, side by side, each with each base.
+
+    Returns the effects' configurations, their values in each row, and the base parameters of all rows.
+    """
+    cfgs, corners, rows = [], [], []
+    for name in names:
+        values, count = bounds_corners(name)
+        begin = len(corners)
+        for base in bases:
+            corners += [{key: v[i] for key, v in values.items()} for i in range(count)]
+            rows += [base] * count
+        cfgs.append(EffectCfg(effect=name, env_rows=slice(begin, len(corners))))
+    return cfgs, corners, {key: torch.tensor([row[key] for row in rows], dtype=torch.float64) for key in bases[0]}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("integrator", "seconds"), [("implicitfast", 2.5), ("leapfrog", 5.0)]
 )  # the harder one for longer
 def test_the_extremes_of_all_bounds_stay_finite_at_the_control_step(integrator, seconds):
     light = {**TRUTH, "armature": 0.01, "friction": 2.0, "viscous_friction": 0.0, "delay": 0.0}
-    cfgs, corners, bases = [], [], []
-    for name in EFFECTS:  # side by side, each on its rows, with each base
-        values, count = bounds_corners(name)
-        begin = len(corners)
-        for base in (TRUTH, light):
-            corners += [(name, {key: v[i] for key, v in values.items()}) for i in range(count)]
-            bases += [base] * count
-        cfgs.append(EffectCfg(effect=name, env_rows=slice(begin, len(corners))))
-    of_rows = {key: torch.tensor([base[key] for base in bases], dtype=torch.float64) for key in TRUTH}
-    bench = Bench(cfgs, num_envs=len(corners), base=of_rows, integrator=integrator)
-    write_rows(bench, [values for _, values in corners])
+    cfgs, corners, base = all_corners(EFFECTS, (TRUTH, light))
+    bench = Bench(cfgs, num_envs=len(corners), base=base, integrator=integrator)
+    write_rows(bench, corners)
     reached = bench.follow(long_chirp(seconds))[:, :, 0]
-    for i, corner in enumerate(zip(corners, bases, strict=True)):
-        assert bool(reached[:, i].isfinite().all()), corner
-        assert float(reached[:, i].abs().max()) < 10.0, corner
+    for i, corner in enumerate(corners):
+        assert bool(reached[:, i].isfinite().all()), (i, corner)
+        assert float(reached[:, i].abs().max()) < 10.0, (i, corner)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("calls", "integrator"), [(1, "implicitfast"), (2, "leapfrog")])
-@pytest.mark.parametrize("name", FAST)
-def test_the_extremes_stay_finite_on_a_robot_with_legs(name, calls, integrator):
-    values, count = bounds_corners(name)
+def test_the_extremes_stay_finite_on_a_robot_with_legs(calls, integrator):
     targets = legs_chirp(env_cfg(ANYMAL), 2.0)
-    base = {"armature": 0.1, "viscous_friction": 1.0, "friction": 1.0, "encoder_bias": 0.0, "delay": 1.0}
-    steps = {"calls": calls, "integrator": integrator}
-    reached = Bench([name], values, num_envs=count, task=ANYMAL, base=base, **steps).follow(targets)
-    assert bool(reached.isfinite().all())
-    # the softest spring resonates: 3.02 at the finest steps
-    assert float((reached - torch.as_tensor(targets)[:, None]).abs().max()) < 3.1
+    cfgs, corners, base = all_corners(
+        FAST, [{"armature": 0.1, "viscous_friction": 1.0, "friction": 1.0, "encoder_bias": 0.0, "delay": 1.0}]
+    )
+    bench = Bench(cfgs, num_envs=len(corners), task=ANYMAL, base=base, calls=calls, integrator=integrator)
+    write_rows(bench, corners)
+    reached = bench.follow(targets)
+    far = (reached - torch.as_tensor(targets)[:, None]).abs().amax(dim=(0, 2))
+    for i, corner in enumerate(corners):
+        assert bool(reached[:, i].isfinite().all()), corner
+        # the softest spring resonates: 3.02 at the finest steps
+        assert float(far[i]) < 3.1, corner
 
 
 def mechanical_energy(bench, load, base):
@@ -211,32 +222,39 @@ def test_environments_with_different_values_do_not_mix():
             assert rms(together[:, i], alone[:, 0]) < 1e-12, (name, i)
 
 
-# friction_drift knows the session's time, which goes on after a reset
-@pytest.mark.parametrize("name", [n for n in EFFECTS if n != "friction_drift"])
-def test_the_reset_of_an_environment_forgets_its_history_only(name):
-    start = {f"{name}.{p.name}": p.start for p in get_effect(name).parameters}
-    bench = Bench([name], start, num_envs=3, base={**TRUTH, "delay": 0.0})
-    bench.start(0.0)
+def side_by_side(starts, each):
+    """A bench on which each effect acts on that many rows of its own."""
+    cfgs = [EffectCfg(effect=name, env_rows=slice(each * i, each * (i + 1))) for i, name in enumerate(starts)]
+    bench = Bench(cfgs, num_envs=each * len(starts), base={**TRUTH, "delay": 0.0})
+    write_rows(bench, [values for values in starts.values() for _ in range(each)])
+    return bench
+
+
+def test_the_reset_of_an_environment_forgets_its_history_only():
+    names = [name for name in EFFECTS if name != "friction_drift"]  # it knows the session's time, which goes on
+    starts = {name: {f"{name}.{p.name}": p.start for p in get_effect(name).parameters} for name in names}
+    bench, fresh, untouched = (side_by_side(starts, each) for each in (3, 1, 1))
+    reset = 3 * torch.arange(len(names)) + 1
     run = [torch.as_tensor(t) for t in MOVING[:80]]
-    for target in run[:40]:
-        bench.env.simulate(target.expand(3, 1))
-    fresh, untouched = (Bench([name], start, base={**TRUTH, "delay": 0.0}) for _ in range(2))
-    fresh.start(0.0)
+    bench.start(0.0)
     untouched.start(0.0)
     for target in run[:40]:
-        untouched.env.simulate(target.expand(1, 1))
-    bench.env.scene.reset(torch.tensor([1]))
-    bench.robot.write_joint_state_to_sim(torch.zeros(1, 1), torch.zeros(1, 1), env_ids=torch.tensor([1]))
+        for each in (bench, untouched):
+            each.env.simulate(target.expand(each.env.num_envs, 1))
+    fresh.start(0.0)
+    bench.env.scene.reset(reset)
+    at_rest = torch.zeros(len(names), 1)
+    bench.robot.write_joint_state_to_sim(at_rest, at_rest, env_ids=reset)
     bench.env.sim.forward()
     for target in run[40:]:
-        bench.env.simulate(target.expand(3, 1))
-        fresh.env.simulate(target.expand(1, 1))
-        untouched.env.simulate(target.expand(1, 1))
-    q = bench.robot.data.joint_pos
-    # 1e-6: forward() has brought what the joints carry to the present, half a step early
-    assert float((q[[0, 2]] - untouched.robot.data.joint_pos).abs().max()) < 1e-6
-    assert float((q[1] - fresh.robot.data.joint_pos[0]).abs().max()) < 1e-9
-    assert float((q[1] - q[0]).abs().max()) > 1e-9
+        for each in (bench, fresh, untouched):
+            each.env.simulate(target.expand(each.env.num_envs, 1))
+    ends = zip(names, bench.robot.data.joint_pos.unflatten(0, (-1, 3)), strict=True)
+    for (name, q), new, old in zip(ends, fresh.robot.data.joint_pos, untouched.robot.data.joint_pos, strict=True):
+        # 1e-6: forward() has brought what the joints carry to the present, half a step early
+        assert float((q[[0, 2]] - old).abs().max()) < 1e-6, name
+        assert float((q[1] - new).abs().max()) < 1e-9, name
+        assert float((q[1] - q[0]).abs().max()) > 1e-9, name
     for each in (bench, fresh, untouched):
         each.env.close()
 

@@ -1,12 +1,12 @@
-"""What is released: wheel and archive, with all they need; the notebook; the files that a repository shows."""
+"""What is released: wheel and archive, with all they need; the files that a repository shows."""
 
-import json
+import os
 import re
+import shutil
 import subprocess
 import sys
 import tarfile
 import zipfile
-from pathlib import Path
 
 import pytest
 from places import ROOT
@@ -23,17 +23,43 @@ NEEDED = (
 )
 
 
+CODE = ("pace_actuators", "pace_envs", "pace_optim")
+
+
 @pytest.fixture(scope="module")
-def built(tmp_path_factory):
-    """Wheel and archive, from a copy of what git has (a build leaves folders behind)."""
-    source, out = tmp_path_factory.mktemp("source") / "pace", tmp_path_factory.mktemp("dist")
-    subprocess.run(["git", "clone", "-q", "--depth", "1", f"file://{ROOT}", source], check=True)
-    subprocess.run(["git", "tag", "v7.8.9"], cwd=source, check=True)
+def source(tmp_path_factory):
+    """What git has, with the working tree's code and assets (a build leaves folders behind)."""
+    copy = tmp_path_factory.mktemp("source") / "pace"
+    subprocess.run(["git", "clone", "-q", "--depth", "1", f"file://{ROOT}", copy], check=True)
+    for folder in (*CODE, "assets"):
+        shutil.rmtree(copy / folder)
+        shutil.copytree(ROOT / folder, copy / folder, ignore=shutil.ignore_patterns("__pycache__"))
+    git = ["git", "-c", "user.name=test", "-c", "user.email=test@localhost"]
+    for words in (["add", "--all"], ["commit", "-q", "--allow-empty", "-m", "Working tree"], ["tag", "v7.8.9"]):
+        subprocess.run([*git, *words], cwd=copy, check=True)
+    return copy
+
+
+@pytest.fixture(scope="module")
+def built(source, tmp_path_factory):
+    """Wheel and archive."""
+    out = tmp_path_factory.mktemp("dist")
     run = subprocess.run(
         [sys.executable, "-m", "build", "--no-isolation", "--outdir", out, source], capture_output=True, text=True
     )
     assert run.returncode == 0, run.stdout[-2000:] + run.stderr[-2000:]
     return out
+
+
+@pytest.fixture(scope="module")
+def wheel(built):
+    with zipfile.ZipFile(next(built.glob("*.whl"))) as archive:
+        yield archive
+
+
+def files_of(folder, pattern):
+    """The files under a folder that belong in a wheel, as paths from the folder."""
+    return {p.relative_to(folder).as_posix() for p in folder.rglob(pattern) if p.is_file()}
 
 
 @pytest.mark.slow
@@ -45,15 +71,33 @@ def test_the_version_is_the_tag_s(built):
 
 
 @pytest.mark.slow
-def test_the_wheel_holds_what_it_needs_and_nothing_else(built):
-    with zipfile.ZipFile(next(built.glob("*.whl"))) as wheel:
-        names = set(wheel.namelist())
-        entry_points = wheel.read("pace_mujoco-7.8.9.dist-info/entry_points.txt").decode()
-    assert names.issuperset(NEEDED)
+def test_the_wheel_holds_what_it_needs_and_nothing_else(wheel):
+    names = wheel.namelist()
+    entry_points = wheel.read("pace_mujoco-7.8.9.dist-info/entry_points.txt").decode()
+    assert set(names).issuperset(NEEDED)
     tops = {name.split("/")[0] for name in names}
-    assert tops == {"pace_actuators", "pace_assets", "pace_envs", "pace_optim", "pace_mujoco-7.8.9.dist-info"}
+    assert tops == {*CODE, "pace_assets", "pace_mujoco-7.8.9.dist-info"}
+    assert not [name for name in names if "__pycache__" in name]
     assert "pace = pace_optim.commands:main" in entry_points
-    assert {"LICENSE", "NOTICE"} <= {Path(name).name for name in names}
+    for file in ("LICENSE", "NOTICE"):
+        assert [name for name in names if name.endswith(f".dist-info/licenses/{file}")]
+
+
+@pytest.mark.slow
+def test_every_asset_module_and_type_marker_is_inside(wheel):
+    wanted = {f"pace_assets/{path}" for path in files_of(ROOT / "assets", "*") if "__pycache__" not in path}
+    wanted |= {f"{package}/{path}" for package in CODE for path in files_of(ROOT / package, "*.py") | {"py.typed"}}
+    missing = wanted - set(wheel.namelist())
+    assert not missing, f"{sorted(missing)} left out: does each folder have an __init__.py?"
+
+
+@pytest.mark.slow
+def test_an_installed_wheel_finds_its_assets_without_the_checkout(wheel, tmp_path):
+    wheel.extractall(tmp_path)  # a pure wheel, unpacked, is what an installation puts on the path
+    code = "from pace_assets import ASSETS_DIR; print(ASSETS_DIR)"
+    env = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=env, capture_output=True, text=True)
+    assert done.stdout.strip() == str(tmp_path / "pace_assets"), done.stderr
 
 
 @pytest.mark.slow
@@ -67,19 +111,6 @@ def test_the_archive_can_be_built_from(built):
         "assets/anymal_d/anymal_d.xml",
         "tests/project/test_release.py",
     } <= names
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(600)
-def test_the_notebook_runs_from_top_to_bottom(warm, tmp_path):
-    cells = json.loads((ROOT / "docs" / "demo.ipynb").read_text("utf-8"))["cells"]
-    assert not any(cell.get("outputs") for cell in cells), "outputs stay out of the repository"
-    code = "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
-    guarded = "if __name__ == '__main__':\n" + "\n".join(f"    {line}" for line in code.splitlines())
-    (tmp_path / "notebook.py").write_text(guarded, encoding="utf-8")
-    run = warm.run("notebook.py", cwd=tmp_path, timeout=580)
-    assert run.returncode == 0, run.stderr[-3000:]
-    assert "stribeck_friction" in run.stdout
 
 
 def test_the_citation_and_the_security_policy_are_there():

@@ -11,7 +11,9 @@ import torch
 from scipy import signal
 
 from pace_optim.estimate.derivatives import Colouring, Jacobian
+from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.recording.dataset import Torques
 
 AT_BOUND = 1e-3
 """A normalised entry this close to -1 or 1 is at its bound, unless its error bar excludes the bound."""
@@ -331,3 +333,31 @@ def _eigen(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Eigenvalues and, row by row, eigenvectors of a symmetric matrix."""
     values, vectors = np.linalg.eigh(matrix)
     return values, vectors.T
+
+
+def torque_noise(residuals: Residuals, torques: Torques) -> list[float]:
+    """Standard deviation of the white noise that would hide as much of each joint's torque, (n,) [N m].
+
+    With e what is left of a torque τ, and Σ the covariance of e by its autocovariance, a scale of the torque would have
+    the variance τᵀΣτ / (τᵀτ)². White noise of the variance
+
+        σ² = τᵀΣτ / τᵀτ
+
+    leaves it the same. Errors that go on from sample to sample, as a filter makes them, count as the noise of few.
+
+    Args:
+        residuals: Of one candidate.
+        torques: What is measured.
+    """
+    error, known = residuals.torque_errors(torques)
+    measured, result = torques.measured[residuals.step], []
+    for j in range(error.shape[-1]):
+        spread = power = 0.0
+        for r in range(error.shape[1]):
+            at = known[:, r, j]
+            if int(at.sum()) > 1:
+                torque, left = measured[at, r, j].numpy(), error[at, r, j].numpy()
+                spread += float(torque @ filtered(torque[None], autocovariance(left))[0])
+                power += float(torque @ torque)
+        result.append((max(spread, 0.0) / power) ** 0.5 if power > 0 else 0.0)
+    return result

@@ -17,7 +17,7 @@ from pace_optim.recording.keys import COMMAND_SERIES, CONDITIONS, JOINT_SERIES, 
 
 from .base import guess_base
 from .column_map import ColumnMap, Source
-from .joints import match, only_numbers
+from .words import match, only_numbers
 from .log import Channel, Log
 from .units import Known, UnitUnknown, guessed_units
 from .words import CURRENTS, GAINS, NEED_FACTOR, UNITS, meaning

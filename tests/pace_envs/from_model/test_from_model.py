@@ -15,7 +15,7 @@ from pace_actuators.base_parameters import CARRIED
 from pace_envs import ManagerBasedRLEnv, load_env_cfg
 from pace_envs.from_model import cfg_from_model
 from pace_envs.from_model.robot import read_robot
-from pace_envs.model_file import limits, read_model_file
+from pace_envs.model_file import read, read_model_file
 from pace_envs.task_source import EnvironmentRecord
 from pace_optim.commands.new_robot import main as new_robot
 from pace_optim.problem.parameter_space import ParameterSpace
@@ -393,8 +393,8 @@ def test_a_written_configuration_is_the_one_that_the_file_stands_for(tmp_path, m
 )
 def test_a_model_that_takes_too_long_or_too_much_memory_is_refused(head, body, message, tmp_path, monkeypatch):
     """They ran without end, and took what memory there was."""
-    monkeypatch.setattr(limits, "_LONGEST_S", 0.5)
-    monkeypatch.setattr(limits, "available_memory", lambda: 1e10)
+    monkeypatch.setattr(read, "_LONGEST_S", 0.5)
+    monkeypatch.setattr(read, "available_memory", lambda: 1e10)
     joint = '<body pos="0 0 1"><joint name="hinge"/><geom size="0.1"/></body>'
     path = tmp_path / "arm.xml"
     path.write_text(f"<mujoco>{head}<worldbody>{joint}{body}</worldbody></mujoco>")

@@ -9,7 +9,7 @@ from without_chance import NUM_ENVS, without_chance
 
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.managers import EventTermCfg, state_only
-from pace_envs.rl.episode_log import DeferredEpisodes
+from pace_envs.rl.runner import DeferredEpisodes
 
 
 def step_both(counted, masked, steps=45):

@@ -163,7 +163,13 @@ def test_the_exported_policies_agree_and_say_what_they_mean(run):
     np.testing.assert_allclose(onnx_action, torch_action.detach().numpy(), atol=1e-5)
 
 
-def test_the_same_seed_trains_the_same_policy(run, tmp_path):
+@pytest.fixture
+def no_export(monkeypatch):
+    """The policy's files, which take a second, are those of ``run``."""
+    monkeypatch.setattr("pace_envs.rl.training.export_policy", lambda *_: None)
+
+
+def test_the_same_seed_trains_the_same_policy(run, tmp_path, no_export):
     settings = RunSettings.read(run)
     settings.log_dir = str(tmp_path)
     again = train(settings)
@@ -171,7 +177,7 @@ def test_the_same_seed_trains_the_same_policy(run, tmp_path):
     assert all(torch.equal(first[name], second[name]) for name in first)
 
 
-def test_a_training_goes_on_where_it_stopped(run):
+def test_a_training_goes_on_where_it_stopped(run, no_export):
     before = torch.load(run / "model_1.pt", weights_only=False)
     assert before["infos"]["env"]["command_scale"] == {"base_velocity": 0.5}
     assert resume(run, max_iterations=3) == run

@@ -14,6 +14,7 @@ from places import ROOT, SUPPORT
 )
 def test_a_resumed_fit_is_the_one_that_was_interrupted_bit_for_bit(core, capability, threads):
     chosen = {"OPENBLAS_CORETYPE": core, "ATEN_CPU_CAPABILITY": capability, "OMP_NUM_THREADS": str(threads)}
+    chosen["OPENBLAS_NUM_THREADS"] = chosen["OMP_NUM_THREADS"]
     path = os.pathsep.join([str(SUPPORT), str(ROOT), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
         [sys.executable, str(SUPPORT / "bit_for_bit.py"), str(threads)],

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from command_lines import run_script
-from effect_envs import rms
+from effect_envs import null_values, rms
 from problems import ANYMAL, BENCH, CALM, DT, chirp, env_cfg, legs_chirp, make_problem, record
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -29,9 +29,15 @@ def problem_with(effects, recordings=None):
 
 def replay(problem, values):
     """Sensed positions of one candidate at every control step, (T, R, n)."""
-    rollout = problem.evaluator().rollout(1)
-    rollout.start(problem.space.from_dict(values)[None], problem.dataset.sampled)
-    return torch.stack([position.clone() for _, position in rollout.samples()])
+    return replays(problem, [values])[:, 0]
+
+
+def replays(problem, candidates):
+    """The same of several candidates side by side, (T, m, R, n)."""
+    rollout = problem.evaluator().rollout(len(candidates))
+    rollout.start(torch.stack([problem.space.from_dict(each) for each in candidates]), problem.dataset.sampled)
+    motion = torch.stack([position.clone() for _, position in rollout.samples()])
+    return motion.unflatten(1, (len(candidates), -1))
 
 
 @pytest.mark.parametrize(
@@ -173,11 +179,21 @@ def test_the_twin_of_a_joint_moves_as_the_robot(without):
     assert rms(*without) < 2e-4
 
 
+@pytest.fixture(scope="module")
+def with_each(bench_and_twin):
+    """Both with each effect, side by side: those of the others are at their null, where they vanish."""
+    nulls = {key: value for name in TWIN_CASES for key, value in null_values(name).items()}
+    candidates = [
+        {**CALM, **nulls, **{f"{name}.{key}": value for key, value in own.items()}} for name, own in TWIN_CASES.items()
+    ]
+    each = [replays(problem.with_effects(list(TWIN_CASES)), candidates) for problem in bench_and_twin]
+    return {name: [motions[:, i] for motions in each] for i, name in enumerate(TWIN_CASES)}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TWIN_CASES)
-def test_an_effect_changes_the_twin_as_it_changes_the_robot(name, bench_and_twin, without):
-    values = {**CALM, **{f"{name}.{key}": value for key, value in TWIN_CASES[name].items()}}
-    motions = [replay(problem.with_effects([name]), values) for problem in bench_and_twin]
+def test_an_effect_changes_the_twin_as_it_changes_the_robot(name, with_each, without):
+    motions = with_each[name]
     changes = [motion - base for motion, base in zip(motions, without, strict=True)]
     assert rms(changes[0]) > 1e-4
     # how the robot's integrator takes a sharp friction is in both of its motions, but where the effect smooths it

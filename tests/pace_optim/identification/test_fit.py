@@ -183,7 +183,7 @@ def check_search_files(folder, result):
 def test_hybrid_is_never_worse_than_either_alone(delay_mode, recordings, tmp_path, no_report):
     """On the recording of a drive that the model cannot follow exactly, and in the delay mode that is not its own."""
     scores = {
-        optimizer: run(tmp_path, recordings["wrong"], optimizer=optimizer, max_iteration=20, delay_mode=delay_mode)[
+        optimizer: run(tmp_path, recordings["wrong"], optimizer=optimizer, max_iteration=10, delay_mode=delay_mode)[
             0
         ].score
         for optimizer in ("hybrid", "least_squares", "cmaes")
@@ -225,8 +225,8 @@ def test_assumptions_are_told_once_and_before_the_search(recordings, tmp_path, n
     assert not any(note in line for note in result.notes for line in summary(result))
 
 
-def test_the_same_seed_gives_the_same_result(recordings, tmp_path, no_report):
-    first, second = (run(tmp_path, recordings["noisy"])[0] for _ in range(2))
+def test_the_same_seed_gives_the_same_result(recordings, whole, tmp_path, no_report):
+    (first, _), (second, _) = whole("noisy", optimizer="hybrid"), run(tmp_path, recordings["noisy"], optimizer="hybrid")
     assert first.parameters == second.parameters and first.score == second.score
 
 
@@ -313,9 +313,9 @@ def test_an_interrupted_fit_ends_cleanly_and_resumes_to_the_same_result(
         assert histories[0] == histories[1]
 
 
-def test_interrupted_twice_resumes_to_the_same_result(recordings, tmp_path, no_report, monkeypatch):
-    options = {"optimizer": "least_squares"}
-    whole, _ = run(tmp_path, recordings["noisy"], **options)
+def test_interrupted_twice_resumes_to_the_same_result(recordings, whole, tmp_path, no_report, monkeypatch):
+    options = {"optimizer": "least_squares", "max_iteration": 20, "save_optimization_process": True}
+    expected, _ = whole("noisy", **options)
     with monkeypatch.context() as patch:
         interrupt_after(patch, "_after_iteration", 3)
         _, folder = run(tmp_path, recordings["noisy"], **options)
@@ -323,7 +323,7 @@ def test_interrupted_twice_resumes_to_the_same_result(recordings, tmp_path, no_r
         interrupt_after(patch, "_after_iteration", 2)
         resume(folder, progress=Silent())
     resumed, _ = resume(folder, progress=Silent())
-    assert same_result(resumed, whole)
+    assert same_result(resumed, expected)
 
 
 def test_interrupted_before_anything_is_known_still_ends_cleanly(recordings, tmp_path, no_report, monkeypatch):
@@ -358,7 +358,7 @@ def test_a_result_is_written_before_it_is_checked_and_an_interrupted_check_leave
 
 def test_a_finished_run_resumes_to_itself(recordings, tmp_path, no_report):
     for optimizer in ("least_squares", "hybrid", "cmaes"):
-        whole, folder = run(tmp_path, recordings["noisy"], optimizer=optimizer, max_iteration=10)
+        whole, folder = run(tmp_path, recordings["noisy"], optimizer=optimizer, max_iteration=4)
         settings = json.loads((folder / "settings.json").read_text())  # another version says the same in other words
         settings["resolved"]["configuration"]["sim2real"]["notes"] = ["bounds: as wide as can be"]
         (folder / "settings.json").write_text(json.dumps(settings))
@@ -367,9 +367,9 @@ def test_a_finished_run_resumes_to_itself(recordings, tmp_path, no_report):
 
 
 def test_a_resumed_search_may_be_given_more_generations(recordings, tmp_path, no_report):
-    whole, _ = run(tmp_path, recordings["noisy"], optimizer="cmaes", max_iteration=14)
-    _, folder = run(tmp_path, recordings["noisy"], optimizer="cmaes", max_iteration=8)
-    resumed, _ = resume(folder, max_iteration=14, progress=Silent())
+    whole, _ = run(tmp_path, recordings["noisy"], optimizer="cmaes", max_iteration=6)
+    _, folder = run(tmp_path, recordings["noisy"], optimizer="cmaes", max_iteration=3)
+    resumed, _ = resume(folder, max_iteration=6, progress=Silent())
     assert same_result(resumed, whole)
 
 

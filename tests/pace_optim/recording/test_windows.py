@@ -9,6 +9,7 @@ from problems import CALM, DT, chirp, env_cfg, make_problem, physical, replayed
 
 from pace_actuators.effects import get_effect
 from pace_envs import set_physics_dt
+from pace_envs.compiler import host_kernels
 from pace_optim.joints.fits.base_fit import joint_vectors
 from pace_optim.joints.fits.model import JointModel
 from pace_optim.joints.fits.side_by_side import SideBySide, Slot
@@ -111,25 +112,33 @@ def test_a_window_begins_at_the_measured_speed(bench):
         assert cut.start_vel[w].tolist() == short.dof_vel[sample].tolist()
 
 
-@pytest.mark.parametrize("effect", [None, *EFFECTS])
-def test_once_its_beginning_is_forgotten_a_window_moves_as_the_whole(bench, effect):
-    model, values = JointModel.base(bench.problem), bench.values
-    if effect is not None:
-        own = torch.tensor([EFFECTS[effect]], dtype=torch.float64)
-        model, values = model.extended(values, get_effect(effect), torch.tensor([True]), own)
+@pytest.fixture(scope="module")
+def whole_and_cut(bench):
+    """Each with its errors, (steps, recordings or windows, joints) by effect; the simulations lie side by side."""
+    model, here = JointModel.base(bench.problem), torch.tensor([True])
+    models = {None: (model, bench.values)} | {
+        effect: model.extended(bench.values, get_effect(effect), here, torch.tensor([own], dtype=torch.float64))
+        for effect, own in EFFECTS.items()
+    }
 
     def errors(problem):
-        batch = SideBySide(problem, [Slot(model=model, rows=1)], training=True)
-        return batch.dataset, batch.simulate([values[None]], batch.dataset.train)[0]
+        slots = [Slot(model=own, rows=1) for own, _ in models.values()]
+        batch = SideBySide(problem, slots, training=True, compiler=host_kernels())
+        found = batch.simulate([values[None] for _, values in models.values()], batch.dataset.train)
+        return batch.dataset, dict(zip(models, found, strict=True))
 
-    whole, error = errors(bench.twins)
-    cut, of_windows = errors(bench.twins.in_windows())
+    return errors(bench.twins), errors(bench.twins.in_windows())
+
+
+@pytest.mark.parametrize("effect", [None, *EFFECTS])
+def test_once_its_beginning_is_forgotten_a_window_moves_as_the_whole(whole_and_cut, effect):
+    (whole, errors), (cut, of_windows) = whole_and_cut
     _, *later = windows_of(cut, whole.recordings[0])
     for w in later:
         at = cut.train[:, w].nonzero()[:, 0]
         start = round(float(cut.start_time[w]) / DT)
-        difference = of_windows[at, w] - error[at + start, 0]
+        difference = of_windows[effect][at, w] - errors[effect][at + start, 0]
         assert float(difference.abs().max()) < 1e-3
         assert float(difference.square().mean().sqrt()) < 2e-4
     if effect is not None:
-        assert float(error.abs().max()) > 5e-3  # it is there
+        assert float(errors[effect].abs().max()) > 5e-3  # it is there

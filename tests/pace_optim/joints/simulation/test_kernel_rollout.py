@@ -12,8 +12,7 @@ from effect_envs import EFFECTS, Branching
 from problems import ANYMAL, CALM, DT, TRUTH, chirp, env_cfg, legs_chirp, make_problem, physical, record
 
 from pace_actuators.effects import get_effect, registry
-from pace_actuators.files import OwnFolder
-from pace_envs.compiler import CannotCompileError, HostKernels, host, host_kernels, kernels_of
+from pace_envs.compiler import CannotCompileError, host, host_kernels, kernels_of
 from pace_envs.simulation import SimulationCfg, make_simulation
 from pace_optim.joints.fits.fits import fits_on
 from pace_optim.joints.fits.fitting_cfg import DEFAULT
@@ -26,17 +25,16 @@ STEPS = 80
 
 
 @pytest.fixture(scope="module", params=["processor", "GPU"])
-def kernels(request, tmp_path_factory):
+def kernels(request):
     """What compiles, and where it runs."""
     if request.param == "GPU":
         if not torch.cuda.is_available():
             pytest.skip("needs a GPU and torch for CUDA")
         device = torch.device("cuda", 0)
         return {"compiler": kernels_of(device), "device": device}
-    if shutil.which("c++") is None:
+    if (compiler := host_kernels()) is None:
         pytest.skip("needs a compiler of C++")
-    folder = OwnFolder.at(tmp_path_factory.mktemp("kernels"))
-    return {"compiler": HostKernels(shutil.which("c++"), folder), "device": torch.device("cpu")}
+    return {"compiler": compiler, "device": torch.device("cpu")}
 
 
 def slots_of(problem, start, *sets):

@@ -21,7 +21,7 @@ def moved_by(problem, physical):
     """Positions of the robot, or of joints alone, at every control step."""
     rollout = problem.evaluator().rollout(1)
     rollout.start(physical[None], problem.dataset.sampled)
-    return torch.stack([position.clone() for position in rollout.simulated(rollout.duration_steps)])
+    return rollout.positions(torch.arange(rollout.duration_steps))
 
 
 def test_friction_turns_where_the_speed_passes_zero():

@@ -11,7 +11,7 @@ import pytest
 from pace_optim.recording import Recording, load_recording
 from pace_optim.recording.gaps import split_at_gaps
 from pace_optim.recording.logs import ColumnMap, Robot, load_recordings, read_map, understood, with_rate
-from pace_optim.recording.notes import notes_by_kind
+from pace_optim.recording.data import notes_by_kind
 from pace_optim.recording.stamps import set_back, unrounded
 from pace_optim.recording.start import start_speed
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 from bench_recordings import CONTROL_DT, Bench, chirp, record
 
-from pace_optim.estimate.error_bars.torque_noise import torque_noise
+from pace_optim.estimate.error_bars.uncertainty import torque_noise
 from pace_optim.identification.fit import fit, fit_with_torques, resume
 from pace_optim.identification.optimization import Optimization
 from pace_optim.problem.evaluator import Residuals
