@@ -545,7 +545,7 @@ def test_other_shapes_are_refused_too():
         motor.compute(ActuatorActions(), [[0.0, 0.0]], torch.zeros(3, 2))
     with pytest.raises(ValueError, match=r"encoder_bias has shape \(3,\), expected \(2, 2\)"):
         motor.update_encoder_bias(torch.zeros(3), [0, 1])
-    with pytest.raises(ValueError, match=r"delay has shape \(4, 1\), expected a number, or a row for each of 3"):
+    with pytest.raises(ValueError, match=r"delay has shape \(4, 1\)\. Expected a number, or 3 rows"):
         motor.update_time_lags(torch.zeros(4))
     with pytest.raises(ValueError, match=r"torque_enable has shape \(2,\), expected \(3,\)"):
         motor.set_torque_enable(torch.ones(2, dtype=torch.bool))

@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 from mujoco import batch
 
-from pace_actuators.text import listed
 from pace_optim.recording import Load
 
 from .robot import PlantRobot
@@ -150,7 +149,9 @@ class RigidBody:
                     _rotate_masses(model, body, joint, angle, row, ipos, iquat, pos, quat)
             for name, kg in load.added_mass.items():
                 if name not in names:
-                    raise ValueError(f"added_mass names {name!r}, which is no body. Available: {listed(names[1:])}.")
+                    raise ValueError(
+                        f"added_mass names {name!r}, which is no body. Available: {', '.join(names[1:]) or 'none'}."
+                    )
                 body = names.index(name)
                 # without a place it is at the centre of mass of the model file, however the body's mass was turned
                 place = load.added_mass_at.get(name, _from_parent(pos[row, body], quat[row, body], unturned[body]))

@@ -20,6 +20,9 @@ from pace_optim.diagnosis.selection.decisions import Decision
 from pace_optim.joints.fits.block_errors import BlockErrors
 from pace_optim.joints.fits.fitted import Fitted
 
+_EFFECTS = 3
+"""Names that a line of progress shows."""
+
 
 def try_effects(search: Search, branch: Branch, rough: bool = False) -> Round | None:
     """Screen effects, refit the promising ones on top of a model, and judge them; ``None`` if none is promising.
@@ -214,7 +217,7 @@ def _ranked(probes: Sequence[Probe], joint: int) -> list[Probe]:
 
 
 def _names(effects: Sequence[type[Effect]]) -> str:
-    return listed([effect.name for effect in effects], 3)
+    return listed([effect.name for effect in effects], _EFFECTS)
 
 
 def _gained(begun: Mapping[type[Effect] | None, Fitted]) -> dict[type[Effect], torch.Tensor]:

@@ -186,7 +186,7 @@ def test_poses_survive_every_format_and_resampling(tmp_path, recording):
 
 @pytest.mark.parametrize(
     ("site", "poses", "said"),
-    [("left_tip", False, "add the series real_ee_pose"), (None, True, "Available: left_tip, right_tip")],
+    [("left_tip", False, "Add the series real_ee_pose"), (None, True, "Available: left_tip, right_tip")],
 )
 def test_an_end_effector_that_is_missing_is_told_with_the_cure(tmp_path, site, poses, said):
     cfg = pendulums_cfg(tmp_path)

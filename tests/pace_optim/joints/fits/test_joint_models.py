@@ -78,7 +78,7 @@ def test_one_value_is_shared_where_that_explains_as_much(bench):
     final = replace(Fitted.start(model, physical), jacobian=jacobian)
     weights = torch.ones(1).double()
     errors = BlockErrors(square=torch.tensor([[1e-8, 1e-8]]).double(), weight=weights)
-    for cost, shared in ((1.0, True), (1.2, False)):
+    for cost, shared in ((1.0, True), (1.3, False)):
         after = BlockErrors(square=cost * errors.square, weight=weights)
         outcome = Outcome(
             problem=None,
