@@ -5,8 +5,8 @@ For each joint, everything but the delay is linear (:mod:`pace_optim.identificat
     τ_drive(t - delay) = τ_links + a q̈ + d q̇ + f sign(q̇) + b + δ τ̇_drive
 
 The armature a, viscous friction d and Coulomb friction f are a start. The delay is the one that leaves least over all
-joints, δ what it lacks; b takes what encoder biases do to gravity. The smoothing that makes q̈ usable leaves a few
-percent of error in them, which the fit takes away.
+joints, δ what it lacks; b takes what encoder biases do to gravity. The smoothing that makes q̈ usable leaves
+errors, of up to a half in a small armature, which the fit takes away.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ from pace_optim.problem.bounded_least_squares import bounded_least_squares
 from pace_optim.problem.problem import Problem
 
 _FOUND = ("armature", "viscous_friction", "friction")
+_UNEXPLAINED = 0.5
+"""Part of a torque's variance without which a joint keeps its start."""
 
 
 def balanced_start(problem: Problem) -> torch.Tensor:
@@ -37,7 +39,9 @@ def balanced_start(problem: Problem) -> torch.Tensor:
             continue
         best, late = left, float(np.median([values[-1] for values, _ in solved]))
         found = {f"delay/{GLOBAL}": delay + late / problem.control_dt}
-        for j, (values, _) in zip(joints, solved, strict=True):
+        for j, (values, part) in zip(joints, solved, strict=True):
+            if part > _UNEXPLAINED:
+                continue
             found |= {f"{name}/{problem.joint_names[j]}": value for name, value in zip(_FOUND, values, strict=False)}
     for i, label in enumerate(space.labels if joints else ()):
         physical[i] = found.get(label, float(physical[i]))

@@ -94,6 +94,12 @@ def test_a_limit_that_the_file_states_bounds_what_a_recording_without_one_may_ha
     assert bounds_of(tmp_path, limit, stiffness=KP, damping=KD)["friction"] == pytest.approx(0.6)
 
 
+def test_a_limit_far_above_what_a_recording_asked_for_is_a_placeholder(tmp_path):
+    """A humanoid's wrists were sought up to a million times their armature, where no derivative is right."""
+    limit = '<limit lower="-2" upper="2" effort="4000" velocity="1000"/>'
+    assert bounds_of(tmp_path, limit, stiffness=KP, damping=KD)["friction"] == pytest.approx(10 * 0.2 * 0.5 * KP)
+
+
 def test_a_springs_rest_is_sought_in_all_of_its_joints_range(tmp_path):
     limit = '<limit lower="-0.4" upper="2.6" effort="3" velocity="10"/>'
     bounds_of(tmp_path, limit, stiffness=KP, damping=KD)
