@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from pace_envs import ManagerBasedRLEnv
+from pace_optim.problem.bounds_of_logs import asked_torque
 from pace_optim.problem.drive_steps import of_joints
-from pace_optim.problem.start import asked_torque
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import Dataset, Work
 

@@ -23,8 +23,8 @@ from scipy.ndimage import gaussian_filter1d
 
 from pace_envs import ManagerBasedEnv
 from pace_optim.problem.bounded_least_squares import bounded_least_squares
+from pace_optim.problem.bounds_of_logs import asked_torque, gains
 from pace_optim.problem.inverse_dynamics import LinkMotion, frame_motion, model_of
-from pace_optim.problem.start import asked_torque, gains
 from pace_optim.recording import Recording
 
 _SMOOTHING = 0.01

@@ -24,6 +24,7 @@ from pace_envs.motor_coordinates import Rows
 from pace_envs.simulation import Simulation
 from pace_envs.tasks.pace import GLOBAL, PaceSim2realEnvCfg, sought_links
 from pace_optim.problem.base_path import BasePath, base_path
+from pace_optim.problem.bounds_of_logs import widen_bounds
 from pace_optim.problem.drive_steps import (
     check_loops,
     least_armature,
@@ -45,7 +46,6 @@ from pace_optim.problem.log_and_robot import (
 from pace_optim.problem.moving_base import on_moving_base
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.recordings import Logs, conform_all, read_logs, tell_on_stderr
-from pace_optim.problem.start import start_by_torques, widen_bounds
 from pace_optim.problem.unknown_facts import GAINS, LIMITS, lift_limits, refined_limits, with_unknown
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import Dataset, Torques, make_dataset
@@ -540,8 +540,6 @@ def _posed(
         low, high = sim2real.bounds["armature"].unbind(dim=1)
         least = torch.as_tensor(least_armature(env, [*recordings, *held_out]))
         sim2real.set_bounds("armature", torch.maximum(low, torch.minimum(least, 0.5 * (low + high))))
-    if is_model_file(facts.task):
-        sim2real.start_params = {**sim2real.start_params, **start_by_torques(env, recordings)}
     simulated = _configured(cfg, physics_dt, with_unknown(effects, unknown))
     space, trees = ParameterSpace.of(simulated.sim2real), independent_trees(env)
     recordings, held_out = affordable(

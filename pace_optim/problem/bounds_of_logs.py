@@ -1,4 +1,4 @@
-"""Where a fit of a model file begins and how far it seeks, by the torques of the log's drives."""
+"""How far a fit of a model file seeks, by the torques of the log's drives."""
 
 from __future__ import annotations
 
@@ -14,48 +14,10 @@ from pace_envs.tasks.pace.pace_cfg import PaceCfg
 from pace_optim.problem.drive_steps import of_joints
 from pace_optim.recording import Recording
 
-_SHARE = 0.1
-"""Of the torque, that each of armature, viscous and Coulomb friction takes at the start."""
 _PLACEHOLDER = 10.0
 """Times what a drive was asked for that its effort limit may be at most."""
 _SMOOTH = 0.02
 """Positions are averaged over this time before they are differentiated [s]."""
-
-
-def start_by_torques(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> dict[str, dict[str, float]]:
-    """Where no parameter takes more than a tenth of the torque that its joint's drive asked for.
-
-    With the root mean squares T of τ = kp (q* - q) + kd (q̇* - q̇) + τ*, V of q̇ and A of q̈ over the recordings:
-
-        armature ≤ 0.1 T / A,     viscous friction ≤ 0.1 T / V,     Coulomb friction ≤ 0.1 T
-
-    and no more than the configuration's own start. A model file's is a part of the effort limits, which are
-    placeholders in many: with 1000 N m, armatures of 2e-4 kg m² begin at 4, and the fit ends in a wrong valley.
-
-    Args:
-        env: The environment, for that start, and the gains that a recording does not state.
-        recordings: On the robot's joints, in its order.
-
-    Returns:
-        {parameter: {joint: value}}.
-    """
-    squares = np.array([_mean_squares(env, recording) for recording in recordings])
-    weights = [recording.num_samples for recording in recordings]
-    torque, speed, acceleration = np.sqrt(np.average(squares, axis=0, weights=weights))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        most = {
-            "armature": _SHARE * torque / acceleration,
-            "viscous_friction": _SHARE * torque / speed,
-            "friction": _SHARE * torque,
-        }
-    sim2real = env.cfg.sim2real  # type: ignore[attr-defined]
-    return {
-        group: {
-            joint: float(np.fmin(sim2real.start_params[group][joint], value))
-            for joint, value in zip(sim2real.joint_order, values, strict=True)
-        }
-        for group, values in most.items()
-    }
 
 
 def widen_bounds(sim2real: PaceCfg, env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> None:
@@ -102,15 +64,6 @@ def _scales(env: ManagerBasedRLEnv, sim2real: PaceCfg, recording: Recording) -> 
     limit = configured if drive.effort_limit is None else drive.effort_limit
     known = np.isfinite(limit) & (drive.effort_limit is not None)
     return np.where(np.isfinite(limit), np.where(known, limit, 0.0), asked), np.where(known, np.inf, most)
-
-
-def _mean_squares(env: ManagerBasedRLEnv, recording: Recording) -> np.ndarray:
-    """Mean squares of torque, speed and acceleration about their means, (3, n), without the ends."""
-    time, half = recording.time, _half(recording)
-    speed = np.gradient(_smooth(recording.dof_pos, half), time, axis=0)
-    inner = slice(half + 2, -half - 2)
-    parts = (asked_torque(env, recording), speed, np.gradient(speed, time, axis=0))
-    return np.array([np.var(each[inner], axis=0) for each in parts])
 
 
 def _half(recording: Recording) -> int:
