@@ -117,7 +117,7 @@ class Plant:
     targets: Callable[[float], np.ndarray]
     """Positions that joints are told at a time, (n,) [rad]; of a policy, at the beginning alone."""
     policy: Callable[[float, mujoco.MjData], np.ndarray] | None = None
-    """The same of a policy, which sees the simulation; ``None``: there is none."""
+    """The same of a policy, which sees the simulation."""
     feet: Mapping[str, str] = field(default_factory=dict)
     """Geom of each foot, by the foot's name; none: nothing touches the ground."""
     swing: float | None = None

@@ -1,7 +1,8 @@
 """The checks of a log name what is wrong with it before a search, and nothing where nothing is."""
 
 import re
-from dataclasses import replace
+from dataclasses import MISSING, fields, replace
+from types import SimpleNamespace
 
 import log_checks as inputs
 import numpy as np
@@ -12,7 +13,8 @@ from scipy.optimize import lsq_linear
 from pace_envs import load_env_cfg
 from pace_envs.task_source import use_task
 from pace_optim.identification.log_checks import check_log, checked
-from pace_optim.identification.log_checks.checks import _flat_ends
+from pace_optim.identification.log_checks.balance import View
+from pace_optim.identification.log_checks.checks import _flat_ends, swapped
 from pace_optim.identification.setup import load_for_fit
 from pace_optim.problem.bounded_least_squares import bounded_least_squares
 from pace_optim.problem.problem import load_problem
@@ -114,3 +116,18 @@ def test_logs_of_strangers_are_named(folder, says):
 def test_a_target_is_cut_where_it_stays_for_longer_than_commands_are_held(repeat, cut, flat):
     target = np.repeat(np.clip(np.sin(0.1 * np.arange(200)), -cut, cut), repeat)
     assert _flat_ends(target).sum() == flat
+
+
+@pytest.mark.parametrize(("crossed", "tried"), [(True, 3), (False, 1)])
+def test_columns_are_tried_as_swapped_alone_where_positions_follow_the_other_target(crossed, tried):
+    """Of a log with fewer rows than commands: their numbers differed, and the check ended the fit."""
+    commands = np.stack([np.sin(0.1 * np.arange(100)), np.cos(0.07 * np.arange(100))], axis=1)
+    steps = np.arange(0, 100, 2)
+    position = 0.9 * commands[steps][:, [1, 0] if crossed else [0, 1]]
+    given = {each.name: None for each in fields(View) if each.init and each.default is MISSING}
+    view = View(**given | {
+        "joints": ("a", "b"), "steps": steps, "position": position,
+        "target": commands, "target_vel": 0 * commands, "feed_forward": 0 * commands,
+    })  # fmt: skip
+    evidence = SimpleNamespace(view=view, doubted={0}, balance={0: None, 1: None})
+    assert len(list(swapped(evidence))) == tried
