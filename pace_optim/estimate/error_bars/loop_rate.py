@@ -39,6 +39,8 @@ _APART = 0.02
 """Part of a period by which a log's must exceed it to be another."""
 UNEXPLAINED = 0.5
 """Part of what no candidate explains. One that is worse than the best by it is two standard deviations away."""
+_HIDDEN = 1e-2
+"""Part of the noise's variance in which an error of the model hides: noise is known no better."""
 _NAMED = 2
 """Values that a sentence shows."""
 
@@ -166,8 +168,8 @@ def loop_rates(
         χ² = (r·r - r'·r') d·d / (dᵀ Σ d)
 
     is what the recordings hold against it, Σ the covariance of the residuals. Its likelihood is exp(-χ² / 2). What the
-    best candidate leaves above the noise, M, is no noise: roughness, or physics that is missing. So χ² is at most
-    (2 (r·r - r'·r') / (M / 2))².
+    best candidate leaves above the noise, M, is no noise: roughness, or physics that is missing. The noise is an
+    estimate, so M is at least a hundredth of it. So χ² is at most (2 (r·r - r'·r') / (M / 2))².
 
     Args:
         problem: What was fitted, with loops of an assumed rate.
@@ -282,7 +284,7 @@ def _against(errors: torch.Tensor, weights: np.ndarray, where: torch.Tensor, noi
     gram = sum(each @ each.T for each in series)
     squares = np.einsum("cm,mn,cn->c", weights, gram, weights)
     best = int(squares.argmin())
-    unexplained = max(squares[best] - noise, 1e-6 * squares[best])
+    unexplained = max(squares[best] - noise, _HIDDEN * squares[best])
     result = np.zeros(len(weights))
     for c in range(len(weights)):
         apart = weights[c] - weights[best]

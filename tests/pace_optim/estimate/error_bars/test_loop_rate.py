@@ -154,3 +154,12 @@ def test_chi_squared_counts_in_the_noise_along_the_difference():
     found = _against(errors, np.eye(2), where, 0.5 * squares[0])
     worse = (squares[1] - squares[0]) / (0.25 * squares[0])
     assert found[0] == 0.0 and found[1] == pytest.approx((2 * worse) ** 2) and found[1] < 1.0
+
+
+def test_a_rate_that_is_worse_by_less_than_the_noise_is_known_is_not_refuted():
+    rng = np.random.default_rng(0)
+    noise = 1e-3 * rng.standard_normal(100_000)
+    apart = 3e-5 * rng.standard_normal(100_000)  # 90 in χ², and a thousandth of the noise's variance
+    errors = torch.as_tensor(np.stack([noise, noise + apart]))[:, :, None, None]
+    found = _against(errors, np.eye(2), torch.ones(100_000, 1, dtype=torch.bool), float((noise**2).sum()))
+    assert 0.0 < found.max() < 1.0
