@@ -62,6 +62,8 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
         for parameter in BASE_PARAMETERS.values():
             if parameter.mujoco and not is_undetermined(drives, parameter.name, name):
                 _set(joint, parameter.mujoco, drives.values(parameter.name, [name])[name])
+        joint.actfrcrange = [0.0, 0.0]  # none: the drive has its limit
+        joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
         joint.solref_friction = model.dof_solref[column]
         joint.solimp_friction = model.dof_solimp[column]
     for name, time_constant in _soft_frictions(drives, robot.joint_names).items():
@@ -156,14 +158,32 @@ def _carrier(spec: mujoco.MjSpec, name: str) -> Any:
 
 
 def model_of(source: Path) -> tuple[mujoco.MjSpec, list[str]]:
-    """The model of a file as it stands; without what is missing, which is noted."""
+    """The model of a file as it stands; without what is missing, which is noted.
+
+    A URDF's bodies that overlap in its own posture do not touch: URDF has no word for that.
+    """
     if source.suffix == ".urdf":
-        return read_model_file(source).spec, []
+        file = read_model_file(source, touches=True)
+        return file.spec, [*file.notes, *_exclude_overlaps(file.spec)]
     spec = mujoco.MjSpec.from_file(str(source))
     if not (missing := missing_files(spec, source)):
         return spec, []
     named = ", ".join(Path(name).name for name in missing[:2]) + (", …" if len(missing) > 2 else "")
     return read_model_file(source).spec, [f"{len(missing)} files of the model are missing ({named}): left out."]
+
+
+def _exclude_overlaps(spec: mujoco.MjSpec) -> list[str]:
+    """Let bodies pass through each other that overlap where all joints are at their zero."""
+    model = compile_model(spec, spec.modelname)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    pairs = {tuple(sorted(int(model.geom_bodyid[g]) for g in contact.geom)) for contact in data.contact}
+    named = [(model.body(first).name, model.body(second).name) for first, second in sorted(pairs)]
+    for first, second in named:
+        spec.add_exclude(bodyname1=first, bodyname2=second)
+    if not named:
+        return []
+    return [f"bodies that overlap in the file's posture do not touch: {listed([' and '.join(p) for p in named], 3)}."]
 
 
 def _in_the_model(kind: type[Effect]) -> bool:

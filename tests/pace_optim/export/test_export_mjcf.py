@@ -228,6 +228,27 @@ def test_drives_of_a_model_file_run_as_they_did_there(tmp_path):
 HELD = {"stiffness": {"shoulder": 300.0, "wrist": 15.0}, "damping": {"shoulder": 20.0, "wrist": 0.5}}
 
 
+def result_of(folder: Path, model: Path, cfg, parameters: dict, drive: dict) -> Path:
+    """A fit of a model file, four physics steps in a control step and a delay of 3.4 of them."""
+    content = {
+        "version": 1,
+        "task": str(model),
+        "environment": EnvironmentRecord.of(str(model), cfg).to_dict(),
+        "joint_names": list(cfg.sim2real.joint_order),
+        "effects": [],
+        "delay_mode": "command",
+        "physics_dt": DT / 4,
+        "control_dt": DT,
+        "parameters": {**parameters, "delay": {"all": 3.4}},
+        "delay_s": 3.4 * DT,
+        "std": {},
+        "drive": drive,
+    }
+    path = folder / "result.json"
+    path.write_text(json.dumps(content))
+    return path
+
+
 @pytest.mark.parametrize(
     ("stiff", "gains", "error"), [(True, {}, 2e-5), (False, HELD, 1.5e-4)], ids=["continuous", "held"]
 )
@@ -248,24 +269,8 @@ def test_what_steps_of_second_order_identified_moves_so_in_plain_steps(tmp_path,
         "viscous_friction": of(1.0, 0.05),
         "friction": of(0.5, 0.02),
         "encoder_bias": of(0.02, -0.03),
-        "delay": {"all": 3.4},
     }
-    content = {
-        "version": 1,
-        "task": str(path),
-        "environment": EnvironmentRecord.of(str(path), cfg).to_dict(),
-        "joint_names": names,
-        "effects": [],
-        "delay_mode": "command",
-        "physics_dt": DT / 4,
-        "control_dt": DT,
-        "parameters": parameters,
-        "delay_s": 3.4 * DT,
-        "std": {},
-        "drive": {**stated, "effort_limit": of(150.0, 28.0), **flags},
-    }
-    result = tmp_path / "result.json"
-    result.write_text(json.dumps(content))
+    result = result_of(tmp_path, path, cfg, parameters, {**stated, "effort_limit": of(150.0, 28.0), **flags})
     targets = 0.4 * chirp(2)
     expected, _ = identified_motion(result, targets)
     exported = export(result, "mjcf")
@@ -288,6 +293,35 @@ def test_a_model_whose_meshes_are_missing_is_written_without_them(tmp_path):
     path.write_text(STIFF)
     assert model_of(path)[1] == []
 
+
+def test_a_urdf_keeps_its_shapes_and_has_the_identified_limits_alone(tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text(WITH_SHAPES)
+    (tmp_path / "arm.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    cfg = cfg_from_model(path)
+    parameters = {name: {"hinge": 0.1} for name in ("armature", "viscous_friction", "friction", "encoder_bias")}
+    drive = {"stiffness": {"hinge": 50.0}, "damping": {"hinge": 1.0}, "effort_limit": {"hinge": 150.0}}
+    exported = export(result_of(tmp_path, path, cfg, parameters, drive), "mjcf")
+    model = mujoco.MjModel.from_xml_string(exported.text)
+    assert model.ngeom == 2 and model.nmesh == 1
+    assert not model.jnt_actfrclimited.any() and model.actuator_forcerange.tolist() == [[-150.0, 150.0]]
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert data.ncon == 0 and "base and arm" in " ".join(exported.notes)
+
+
+WITH_SHAPES = """
+<robot name="arm">
+  <link name="root"/>
+  <link name="base"><inertial><mass value="2"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><geometry><box size="1 1 1"/></geometry></collision></link>
+  <link name="arm"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><geometry><mesh filename="arm.obj"/></geometry></collision></link>
+  <joint name="table" type="fixed"><parent link="root"/><child link="base"/></joint>
+  <joint name="hinge" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
+    <limit effort="1" lower="-1" upper="1" velocity="1"/></joint>
+</robot>
+"""
 
 STIFF = """
 <mujoco>
