@@ -64,8 +64,8 @@ def next_line(result: FitResult, folder: Path, *, compared: bool = False) -> lis
         return []
     run = shlex.quote(str(folder))
     if result.times_noise < ABOVE_NOISE:
-        robot = shlex.quote(f"{result.robot_name}_identified.xml")
-        return [f"next: {command('export')} {run} --format mjcf --output {robot}"]
+        fmt, ending = ("cfg", "drives.py") if result.effects else ("mjcf", "identified.xml")  # MJCF has few effects
+        return [f"next: {command('export')} {run} --format {fmt} --output {shlex.quote(f'{result.robot_name}_{ending}')}"]
     verb = "diagnose" if compared or (result.std_means_nothing and not result.effects) else "compare"
     return [f"next: {command(verb)} {run}"]
 
