@@ -233,8 +233,7 @@ class _Screened:
     loads: dict[str, dict[str, dict[str, float]]]
     """Where the load of a link is sought first, as values of parameters."""
     joint_of: dict[str, str]
-    """The joint on which each look-alike would explain most; none where all of them on a joint would explain too
-    little."""
+    """The joint on which each look-alike would explain most, of those that would explain as much as a link must."""
 
 
 def _screened(now: _Fitted, found: tuple[Reference, ...], cfg: DiagnosisCfg) -> _Screened:
@@ -296,15 +295,10 @@ def _screened(now: _Fitted, found: tuple[Reference, ...], cfg: DiagnosisCfg) -> 
     for _, each in sorted(promising, key=lambda each: -each[0]):
         if sum(each.link == other.link for other in links) < cfg.links.of_link:
             links.append(each)
-    together = (
-        gain([label for effect, p in sizes.items() if (label := f"{effect}.{p.name}/{joint}") in place])
-        for joint in problem.joint_names
-    )
-    alike = {effect: gains for effect, gains in on_joints.items() if gains} if max(together) > least else {}
     order = tuple(each.link for each in every)
-    return _Screened(
-        links, order, loads, {effect: max(gains, key=gains.__getitem__) for effect, gains in alike.items()}
-    )
+    alike = {effect: max(gains, key=gains.__getitem__) for effect, gains in on_joints.items() if gains}
+    joint_of = {effect: joint for effect, joint in alike.items() if on_joints[effect][joint] > least}
+    return _Screened(links, order, loads, joint_of)
 
 
 def _look(problem: Problem, x: torch.Tensor, cfg: LinksCfg) -> tuple[torch.Tensor, torch.Tensor, float]:
