@@ -125,7 +125,7 @@ class Links:
         """Inertia of each joint, and the torque that the rest of the robot leaves on it.
 
         With the speeds of all degrees of freedom v = T v_d of those of the driven joints, bias b and passive torques s
-        (springs, the friction of joints without drives):
+        (springs, viscous and Coulomb friction of joints without drives):
 
             I_j = (T' M T)_jj,    f_j = I_j a_j - [T' (M a + b - s)]_j
         """
@@ -134,14 +134,15 @@ class Links:
         qpos, qvel, qacc = (each.numpy() for each in self._of_joints(motion))
         for r, model in enumerate(self.models):
             data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
-            carried = self._carried(model, motion, r)
+            carried, friction = self._carried(model, motion, r), model.dof_frictionloss.copy()
+            friction[self.columns] = 0.0
             for k in range(shape[0]):
                 data.qpos[:], data.qvel[:] = qpos[k, r], qvel[k, r]
                 mujoco.mj_fwdPosition(model, data)
                 mujoco.mj_fwdVelocity(model, data)
                 mujoco.mj_fullM(model, data, mass)
                 bias = data.qfrc_bias if carried is None else carried[k]
-                missing = mass @ qacc[k, r] + bias - data.qfrc_passive
+                missing = mass @ qacc[k, r] + bias - data.qfrc_passive + friction * np.sign(qvel[k, r])
                 load[k, r] = -self._efforts(bias)[self.columns]
                 if (follow := self.following(data.qpos)) is None:
                     inertia[k, r], missing = mass.diagonal()[self.columns], missing[self.columns]

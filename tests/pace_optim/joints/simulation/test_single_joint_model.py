@@ -127,10 +127,13 @@ def test_a_joint_is_moved_by_what_its_neighbours_did_whatever_they_are_said_to_b
 SPRUNG = FOUR_BAR.replace('"rocker"', '"rocker" stiffness="0.6" springref="0.3" damping="0.02" armature="0.002"')
 
 
+RUBBING = FOUR_BAR.replace('"rocker"', '"rocker" frictionloss="0.02"')
+
+
 LEANING = FINGER.replace('stiffness="0.02"', 'stiffness="0.2"')
 
 
-@pytest.mark.parametrize("model", [FOUR_BAR, SPRUNG, LEANING], ids=["four_bar", "sprung", "leaning"])
+@pytest.mark.parametrize("model", [FOUR_BAR, SPRUNG, RUBBING, LEANING], ids=["four_bar", "sprung", "rubbing", "leaning"])
 def test_a_crank_feels_what_follows_it(tmp_path, model):
     """Inertia, springs and friction of joints without drives, along the loop that they close.
 
