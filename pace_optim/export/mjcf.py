@@ -57,15 +57,16 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
     spec, left_out = model_of(source)
     couplings = cfg.scene.robot.couplings
     add_motors(spec, couplings, source)
-    for name, column in zip(robot.joint_names, robot.dof_columns.tolist(), strict=True):
+    driven = int(robot.dof_columns[0])
+    for element in [*spec.joints, *spec.tendons]:  # what has no drive rubs as in the fit too
+        element.solref_friction, element.solimp_friction = model.dof_solref[driven], model.dof_solimp[driven]
+    for name in robot.joint_names:
         joint = _carrier(spec, name)  # the base parameters: an elastic joint's inertia sits in the drive while it runs
         for parameter in BASE_PARAMETERS.values():
             if parameter.mujoco and not is_undetermined(drives, parameter.name, name):
                 _set(joint, parameter.mujoco, drives.values(parameter.name, [name])[name])
         joint.actfrcrange = [0.0, 0.0]  # none: the drive has its limit
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-        joint.solref_friction = model.dof_solref[column]
-        joint.solimp_friction = model.dof_solimp[column]
     for name, time_constant in _soft_frictions(drives, robot.joint_names).items():
         joint = _carrier(spec, name)
         joint.solref_friction = [time_constant, 1.0]

@@ -39,12 +39,10 @@ def write_joints(spec):
         spec: The mujoco.MjSpec that your spec_fn returns; it is changed.
     """
     import math
-    import re
 
     for joint in spec.joints:
-        if any(re.fullmatch(name, joint.name) for actuator in ACTUATORS for name in actuator.target_names_expr):
-            joint.solref_friction = [2 * PHYSICS_DT, 1.0]
-            joint.solimp_friction = [0.999, 0.999, 0.001, 0.5, 2.0]
+        joint.solref_friction = [2 * PHYSICS_DT, 1.0]
+        joint.solimp_friction = [0.999, 0.999, 0.001, 0.5, 2.0]
         beside = BESIDE.get(joint.name)
         if beside:
             unit = math.degrees(1.0) if spec.compiler.degree and joint.type.name == "mjJNT_HINGE" else 1.0
