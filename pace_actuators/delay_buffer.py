@@ -1,12 +1,13 @@
 """A delay of a real number of steps, one per environment."""
 
 import math
-from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from collections.abc import Hashable, Sequence
+from typing import ClassVar, Literal, NamedTuple
 
 import torch
 
 from pace_actuators.memory import check_memory
+from pace_actuators.part import Part
 
 Interpolation = Literal["linear", "hold"]
 
@@ -26,7 +27,7 @@ class Jump(NamedTuple):
     """The part of the time that is before the change, (num_envs, 1 or num_joints)."""
 
 
-class DelayBuffer:
+class DelayBuffer(Part):
     """Delays a batched signal (num_envs, num_joints) by a separate time lag for every environment.
 
     With the lag d = i + f (i whole steps, f the fraction), the output at step k is
@@ -46,6 +47,8 @@ class DelayBuffer:
     On a GPU, where the buffer is in the ring and how old its history is are tensors, one number per environment: a
     CUDA graph repeats a step, and nothing is counted in Python.
     """
+
+    memory: ClassVar[Sequence[str]] = ("_storage", "_head", "_stale", "_any_stale", "_row", "_age")
 
     def __init__(
         self,
@@ -136,6 +139,10 @@ class DelayBuffer:
                 "environments, with one column for all joints or one per joint."
             ) from None
         self._index_lags()
+
+    def flags(self) -> dict[str, Hashable]:
+        """None: it counts, and what it does is the same."""
+        return {}
 
     def set_lead(self, lead: float) -> None:
         """Say by how much the simulator lets what it gets act too early [steps], 0 to 0.5: it is added to all lags."""

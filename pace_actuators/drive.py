@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 import re
 import warnings
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from typing import Any, ClassVar
 
 import torch
 
 from pace_actuators.base_parameters import CARRIED
-from pace_actuators.delay_buffer import DelayBuffer, Jump
+from pace_actuators.delay_buffer import Jump
 from pace_actuators.drive_delays import DriveDelays
 from pace_actuators.effects import EffectCfg, EffectStack, effect_cfgs
 from pace_actuators.identified import delay_in_steps, step_notes
 from pace_actuators.joint_values import JointValue, resolve_joint_values
 from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
-
-if TYPE_CHECKING:
-    from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
+from pace_actuators.part import Part
 
 
 def calls_per_run(cfg: PaceDCMotorCfg, physics_dt: float | None) -> int | None:
@@ -160,10 +159,14 @@ class ControllerRun:
     added: torch.Tensor | None = None
 
 
-class Drive:
+class Drive(Part):
     """The numbers, delays and effects of a group of joints' drives; the law is :class:`PaceDCMotor`'s."""
 
     is_implicit_model = False
+    memory: ClassVar[Sequence[str]] = (
+        *("computed_effort", "motor_effort", "applied_effort", "_held_effort", "_speed_slope", "_loop_slope"),
+        *("_calls_until_control", "_run", "_renewed", "_any_renewed", "_alone", "_since_run", "_held_pos", "_held_vel"),
+    )
 
     def __init__(
         self,
@@ -254,9 +257,8 @@ class Drive:
         calls = calls_per_run(cfg, dt)
         self._own_dt = cfg.drive_dt if calls is None else None
         self._calls_per_run = calls = calls or 1
-        if self._own_dt is not None:
-            self._since_run = torch.full_like(self.stiffness, self._own_dt)
-            self._held_pos, self._held_vel = torch.zeros_like(self.stiffness), torch.zeros_like(self.stiffness)
+        self._since_run = torch.full_like(self.stiffness, self._own_dt or 0.0)
+        self._held_pos, self._held_vel = torch.zeros_like(self.stiffness), torch.zeros_like(self.stiffness)
         self._delays = DriveDelays(
             delayed,
             max_delay,
@@ -398,26 +400,35 @@ class Drive:
             given = self.effects.state.enabled
             given.copy_(torch.ones_like(given) if self.torque_enable is None else self.torque_enable.expand_as(given))
 
-    def parts(self) -> list[Any]:
-        """The objects that keep something from call to call: itself, its effects, and what delays; without buffers."""
-        stack = self.effects
-        return [self, self._delays, *([] if stack is None else [stack, *stack.effects])]
+    def parts(self) -> dict[str, Part]:
+        """All that keeps something from call to call, by name: itself, its delays, its effects and their state."""
+        parts: dict[str, Part] = {"drive": self, "delays": self._delays}
+        parts |= {f"delays.{name}": buffer for name, buffer in self._delays.buffers.items()}
+        if self.effects is not None:
+            parts |= {"effects": self.effects, "effects.state": self.effects.state}
+            for i, effect in enumerate(self.effects.effects):
+                parts[own := f"effects.{i}.{effect.name}"] = effect
+                parts |= {f"{own}.{name}": buffer for name, buffer in effect.buffers.items()}
+        return parts
 
-    def delays(self) -> list[DelayBuffer]:
-        """The buffers of the drive's delay and of its effects'."""
-        held = [value for each in self.parts() for value in vars(each).values() if isinstance(value, DelayBuffer)]
-        return [*self._delays.buffers, *held]
+    def branches(self) -> dict[str, dict[str, Hashable]]:
+        """All that Python branches over in a call, by part: with the same, calls do the same operations."""
+        return {name: part.flags() for name, part in self.parts().items()}
 
-    def flags(self) -> list[tuple]:
-        """Everything of the drive and its effects that is no tensor and can be compared: what Python branches over."""
-        return [
-            tuple(
-                (key, frozenset(value) if isinstance(value, set) else value)
-                for key, value in vars(each).items()
-                if value is None or isinstance(value, (bool, int, float, str, set))
-            )
-            for each in self.parts()
-        ]
+    @torch.inference_mode(False)  # may be restored outside of the caller's inference mode too
+    def snapshot(self) -> dict[str, Any]:
+        """All that it keeps from call to call, by name: copies. Nearly all are tensors."""
+        return {
+            f"{name}.{key}": _copied(getattr(part, key)) for name, part in self.parts().items() for key in part.kept()
+        }
+
+    @torch.inference_mode(False)
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Go on from a :meth:`snapshot` of it, or of a drive like it; its numbers stay."""
+        parts = self.parts()
+        for name, value in snapshot.items():
+            part, _, key = name.rpartition(".")
+            setattr(parts[part], key, _copied(value))
 
     def _check_shapes(self, **given: torch.Tensor | None) -> None:
         """Refuse what has not a row per environment and a column per joint: torch would spread it without a word."""
@@ -450,6 +461,10 @@ class Drive:
             device=self._device,
             dtype=self._dtype,
         )
+
+
+def _copied(value: Any) -> Any:
+    return value.clone() if isinstance(value, torch.Tensor) else copy.copy(value)
 
 
 def _applies(cfg: EffectCfg, joint_names: Sequence[str]) -> bool:

@@ -184,25 +184,20 @@ class OtherDelay(Effect):
     def prepare(self) -> None:
         """Lags in the steps of the path: torques pass at every physics step, targets at every run of the controller."""
         dt = self.dt if self.delay_mode == "command" else self.control_dt
-        if not hasattr(self, "_buffer"):
-            upper = self.parameters[0].upper / dt
-            self._buffer = DelayBuffer(upper, self.shape[0], self._options["device"])
-        lags = self.delay / dt
-        self._buffer.set_time_lag(lags.clamp(0.0, self._buffer.max_delay).double())
-
-    def reset_state(self, rows: torch.Tensor | slice) -> None:
-        """Forget the history."""
-        self._buffer.reset(rows)
+        upper = self.parameters[0].upper / dt
+        if not self.buffers:
+            self.buffers["path"] = DelayBuffer(upper, self.shape[0], self._options["device"])
+        self.buffers["path"].set_time_lag((self.delay / dt).clamp(0.0, upper).double())
 
     def command(self, s: DriveState) -> None:
         """Delay the target where the base delays the torque."""
         if self.delay_mode == "effort":
-            s.joint_pos_target = self._buffer.compute(s.joint_pos_target)
+            s.joint_pos_target = self.buffers["path"].compute(s.joint_pos_target)
 
     def effort_command(self, s: DriveState) -> None:
         """Delay the torque where the base delays the command."""
         if self.delay_mode == "command":
-            s.effort = self._buffer.compute(s.effort)
+            s.effort = self.buffers["path"].compute(s.effort)
             s.speed_slope *= (1 - self.delay / self.dt).clamp(min=0.0)
 
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import copy
 import operator
+from collections.abc import Hashable, Sequence
 
 import torch
+
+from pace_actuators.part import Part
 
 _LINK_FIELDS = ("load_stiffness", "link_inertia", "spare_inertia")
 
 
-class DriveState:
+class DriveState(Part):
     """The quantities of a drive at one instant, each (rows, num_joints); a field is changed in place or assigned.
 
     What effects change:
@@ -104,10 +106,17 @@ class DriveState:
             raise AttributeError(f"{name} is not computed for this effect: declare {flag} = True in its class.")
         raise AttributeError(f"The drive's state has no {name!r}. Available: {', '.join(_FIELDS)}.")
 
-    def __deepcopy__(self, memo: dict) -> DriveState:
-        """A copy with separate tensors; tensors that share memory still share it in the copy."""
-        fields = {name: getattr(self, name) for name in _FIELDS if hasattr(self, name)}
-        return DriveState(copy.deepcopy(fields, memo))
+    def kept(self) -> Sequence[str]:
+        """All fields."""
+        return _FIELDS
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """All fields, but those of load and link where they are not wanted."""
+        return {name: getattr(self, name) for name in _FIELDS if hasattr(self, name)}
+
+    def flags(self) -> dict[str, Hashable]:
+        """None."""
+        return {}
 
 
 def _field(name: str) -> property:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import torch
 
+from pace_actuators.delay_buffer import DelayBuffer
 from pace_actuators.joint_units import JOINT_TYPES, JointType
+from pace_actuators.part import Part
 
 if TYPE_CHECKING:
     from pace_actuators.effects.drive_state import DriveState
@@ -115,7 +117,7 @@ class EffectParameter:
         return max(low, least), min(high, most)
 
 
-class Effect:
+class Effect(Part):
     """A physical effect on a group of joints, batched over environments.
 
     A subclass declares its parameters and overrides the methods of the stages where it acts; each changes the
@@ -138,6 +140,7 @@ class Effect:
         control_dt: Time between two runs of the controller [s], the control step unless the drive has its own.
         is_trapezoidal: Whether the simulator moves positions with the mean of the old and the new speed.
         new_rows: Which rows have no history yet, (rows, 1) bool; on the CPU ``None`` if all have.
+        buffers: Its delays, by name; a reset of rows resets them too.
     """
 
     name: ClassVar[str]
@@ -230,6 +233,7 @@ class Effect:
         self._options: dict[str, Any] = {"device": torch.device(device), "dtype": dtype}
         self._on_device = torch.device(device).type == "cuda"
         self.new_rows: torch.Tensor | None = ~self._no_rows()
+        self.buffers: dict[str, DelayBuffer] = {}
         for parameter in self.parameters:
             value = parameter.start if parameter.null is None else parameter.null
             setattr(self, parameter.name, self.full(value))
@@ -247,6 +251,8 @@ class Effect:
         if self.new_rows is None:
             self.new_rows = self._no_rows()
         self.new_rows[rows] = True
+        for buffer in self.buffers.values():
+            buffer.reset(rows)
 
     def remember(self, heat: Heat) -> None:
         """When a recording begins: take over what the drive did in its session before."""
@@ -343,6 +349,10 @@ class Effect:
         return torch.zeros(self.shape[0], 1, dtype=torch.bool, device=self._options["device"])
 
     # ---- what the drive calls ------------------------------------------------------------------------------------
+
+    def kept(self) -> Collection[str]:
+        """What it keeps from call to call."""
+        return (*self.memory, "new_rows")
 
     def set_parameter(
         self, name: str, values: torch.Tensor | float, rows: Any = slice(None), joints: Any = None

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, ClassVar
 
 import torch
 
@@ -13,6 +13,7 @@ from pace_actuators.effects.effect import Effect
 from pace_actuators.effects.effect_cfg import EffectCfg
 from pace_actuators.effects.two_mass import join_couplings
 from pace_actuators.joint_values import resolve_joint_values
+from pace_actuators.part import Part
 
 _IN_DRIVE = ("current_limit", "current_loop", "drive", "torque_speed")
 """The way of a torque through the drive: what is asked, what flows, what comes of it, what the supply leaves."""
@@ -34,8 +35,10 @@ _STAGES = (
 )
 
 
-class EffectStack:
+class EffectStack(Part):
     """Holds a drive's effects and the state that they share."""
+
+    memory: ClassVar[Sequence[str]] = ("_step_begun",)
 
     def __init__(
         self,
@@ -71,8 +74,6 @@ class EffectStack:
         self._num_envs = num_envs
         self.dt = dt
         self.effects: list[Effect] = []
-        self.cfgs: list[EffectCfg] = []
-        self._view: dict[Effect, DriveState] = {}
         for cfg in cfgs:
             rows = slice(None) if cfg.env_rows is None else cfg.env_rows
             effect = cfg.effect_class(
@@ -86,22 +87,22 @@ class EffectStack:
                 dtype=dtype,
             )
             self.effects.append(effect)
-            self.cfgs.append(cfg)
-            self._view[effect] = self.state.of_rows(rows, effect.reads_load, effect.reads_link)
             self._configure(effect, cfg)
+        self._step_begun = False
+        self._arrange()
+
+    def _arrange(self) -> None:
+        """Note what each effect sees of the state, and what they do together."""
+        self.views = {each: self.state.of_rows(each.rows, each.reads_load, each.reads_link) for each in self.effects}
+        """What each effect sees of the state."""
         self._at = {
             stage: [
-                (getattr(effect, stage), self._view[effect])
+                (getattr(effect, stage), self.views[effect])
                 for effect in sorted(self.effects, key=_side if stage == "transmission" else lambda _: 0)
                 if effect.overrides(stage)
             ]
             for stage in _STAGES
         }
-        self._step_begun = False
-        self._arrange()
-
-    def _arrange(self) -> None:
-        """Note what the effects do together."""
         self.acts_in_drive = any(self._at[stage] for stage in _IN_DRIVE)
         """Whether what is asked of the motor becomes another torque between its two limits."""
         self.changes_passive = bool(self._at["friction"] or self._at["transmission"])
@@ -134,24 +135,10 @@ class EffectStack:
         for act, view in self._at[stage]:
             act(view)
 
-    def standing_in(
-        self, twins: Mapping[Effect, Effect], state: DriveState, views: Mapping[Effect, DriveState]
-    ) -> EffectStack:
-        """A stack of copies of some of its effects.
-
-        Args:
-            twins: The copies of effects.
-            state: What they share.
-            views: What each copy sees of that.
-        """
+    def of(self, effects: Sequence[Effect], state: DriveState) -> EffectStack:
+        """A stack like it, of effects that share a state."""
         stack = copy.copy(self)
-        stack.effects = [twins[effect] for effect in self.effects if effect in twins]
-        stack.cfgs = [cfg for effect, cfg in zip(self.effects, self.cfgs, strict=True) if effect in twins]
-        stack.state, stack._view, stack._num_envs = state, dict(views), len(state.time)
-        own = {
-            stage: [twins[act.__self__] for act, _ in acts if act.__self__ in twins] for stage, acts in self._at.items()
-        }
-        stack._at = {stage: [(getattr(each, stage), views[each]) for each in acting] for stage, acting in own.items()}
+        stack.effects, stack.state, stack._num_envs = list(effects), state, len(state.time)
         stack._arrange()
         return stack
 

@@ -13,8 +13,9 @@ import torch
 
 from pace_actuators import PaceDCMotor
 from pace_actuators.delay_buffer import DelayBuffer
-from pace_actuators.effects import Effect, EffectStack
+from pace_actuators.effects import Effect
 from pace_actuators.effects.drive_state import DriveState
+from pace_actuators.part import Part
 from pace_envs.compiled_drive.drive_code import Program, Read
 from pace_envs.compiler.operations import TYPES, UNARY, is_compared, rule
 from pace_envs.compiler.tape import Node, NotTraceableError, Ring, Tape
@@ -360,7 +361,7 @@ class OneJoint:
         Raises:
             NotTraceableError: If something counts steps in Python.
         """
-        before = self.drive.flags()
+        before = self.drive.branches()
         if hold is not None:
             hold()
         shown = {"out": self.tracer.node(self.robot.sensed_joint_pos())}
@@ -372,7 +373,7 @@ class OneJoint:
                 shown.setdefault("effort", self.tracer.node(self.drive.motor_effort))
             self.robot._sim.step()
             self.robot.update()
-        if self.drive.flags() != before:
+        if self.drive.branches() != before:
             raise NotTraceableError("a drive or an effect that counts steps in Python")
         return shown
 
@@ -416,7 +417,7 @@ class OneJoint:
         value = true[key]
         if value.ndim < 2 or value.dtype not in TYPES:  # the same for all joints
             return
-        place = value.data_ptr(), value.shape, value.dtype
+        place = _place(value)
         if place not in self._known:
             kind = TYPES[value.dtype]
             entries = value.shape[2] if value.ndim == 3 else 1
@@ -475,56 +476,55 @@ class OneJoint:
 
     def _copied_drive(self) -> PaceDCMotor:
         actuator, stack = self._actuator, self._actuator.effects
-        begin, end = self.rows.start, self.rows.stop
-        twins: dict[Effect, Effect] = {}
-        effects: EffectStack | None = None
-        if stack is not None:
-            rows = {effect: effect.rows.indices(actuator._num_envs)[:2] for effect in stack.effects}
-            acting = [effect for effect in stack.effects if rows[effect][0] <= begin and end <= rows[effect][1]]
-            states = self._states([stack.state, *(stack._view[effect] for effect in acting)])
-            for effect in acting:
-                twins[effect] = self._copied(effect, rows[effect][0])
-                twins[effect].shape, twins[effect].rows = (1, 1), slice(None)
-            if acting:
-                effects = stack.standing_in(twins, states[0], dict(zip(twins.values(), states[1:], strict=True)))
-        drive = self._copied(actuator)
-        drive.effects = effects
-        drive._num_envs, drive._joint_names, drive._joint_indices = 1, drive._joint_names[:1], slice(None)
-        drive._delays = copy.copy(actuator._delays)
-        drive._delays._silent = set(actuator._delays._silent)
-        drive._delays._buffers = {name: self._delay(each) for name, each in actuator._delays._buffers.items()}
+        drive: PaceDCMotor = self._copied(actuator)
+        drive._num_envs, drive._joint_names, drive._joint_indices = 1, actuator.joint_names[:1], slice(None)
+        drive._delays, drive.effects = copy.copy(actuator._delays), None
+        drive._delays.buffers = self._traced(actuator._delays.buffers)
+        acting = {} if stack is None else self._acting(stack.effects)
+        if stack is not None and acting:
+            state = self._state(stack.state, [stack.views[effect] for effect in acting])
+            twins = [self._copied(effect, begin) for effect, begin in acting.items()]
+            for twin, (effect, begin) in zip(twins, acting.items(), strict=True):
+                twin.shape, twin.rows, twin.buffers = (1, 1), slice(None), self._traced(effect.buffers, begin)
+            drive.effects = stack.of(twins, state)
         return drive
 
-    def _copied(self, thing: Any, begin: int = 0) -> Any:
-        """A copy of an object whose tensors all are of the drive's joints."""
-        twin = copy.copy(thing)
-        for key, value in vars(thing).items():
-            if isinstance(value, torch.Tensor):
-                self.replace(vars(twin), vars(thing), key, begin)
-            elif isinstance(value, DelayBuffer):
-                vars(twin)[key] = self._delay(value, begin)
+    def _acting(self, effects: Sequence[Effect]) -> dict[Effect, int]:
+        """Those that act in its rows, and where their own rows begin."""
+        own = {effect: range(self._actuator._num_envs)[effect.rows] for effect in effects}
+        first, last = self.rows[0], self.rows[-1]
+        return {effect: rows.start for effect, rows in own.items() if first in rows and last in rows}
+
+    def _copied(self, part: Part, begin: int = 0) -> Any:
+        """A copy of a part whose tensors all are of the drive's joints."""
+        twin = copy.copy(part)
+        for key in part.tensors():
+            self.replace(vars(twin), vars(part), key, begin)
         return twin
 
-    def _states(self, states: Sequence[DriveState]) -> list[DriveState]:
-        """A drive's state and views of it, which share memory."""
-        whole: dict[str, torch.Tensor] = {}
-        for name in DriveState.__annotations__:
-            true = {name: getattr(states[0], f"_{name}")}
-            self.replace(whole, true, name)
-            index = len(self.leaves) - 1
-            for view in states[1:]:
-                if hasattr(view, f"_{name}"):
-                    tensor = getattr(view, f"_{name}")
-                    self._known[tensor.data_ptr(), tensor.shape, tensor.dtype] = whole[name], index
-        kept = [[name for name in whole if hasattr(state, f"_{name}")] for state in states]
-        return [DriveState({name: whole[name] for name in names}) for names in kept]
+    def _state(self, state: DriveState, views: Sequence[DriveState]) -> DriveState:
+        """What stands for a drive's state, and for what is seen of it through its views."""
+        twin: dict[str, torch.Tensor] = {}
+        for name, tensor in state.tensors().items():
+            self.replace(twin, {name: tensor}, name)
+            seen = [view.tensors().get(name) for view in views]
+            self._known |= {_place(each): self._known[_place(tensor)] for each in seen if each is not None}
+        return DriveState(twin)
 
-    def _delay(self, buffer: DelayBuffer, begin: int = 0) -> TracedDelay:
+    def _traced(self, buffers: Mapping[str, DelayBuffer], begin: int = 0) -> dict[str, DelayBuffer]:
+        """What stands for delays."""
+        return {name: self._delay(buffer, begin) for name, buffer in buffers.items()}
+
+    def _delay(self, buffer: DelayBuffer, begin: int) -> TracedDelay:
         rows = slice(self.rows.start - begin, self.rows.stop - begin)
         shape = len(self.rows), len(self.columns)
         delay = TracedDelay(self.tracer, lambda: self.leaf(lambda: buffer._total[rows].expand(shape)[None]), buffer)
         self._delays.append((delay, lambda: buffer.history()[:, rows].expand(-1, *shape)))
         return delay
+
+
+def _place(tensor: torch.Tensor) -> tuple:
+    return tensor.data_ptr(), tensor.shape, tensor.dtype
 
 
 def commands(env: ManagerBasedEnv, dataset: Commands, name: str) -> torch.Tensor:

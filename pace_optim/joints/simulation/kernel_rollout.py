@@ -66,7 +66,7 @@ class KernelRollout:
         """
         self._rollout, self._parts, self._compiler, self._device = rollout, list(parts), compiler, device
         self._groups: list[_Group] = []
-        self._flags: object = None
+        self._branches: object = None
         self._series: dict[tuple[tuple[str, ...], int], torch.Tensor] = {}
         self._streams: list[torch.cuda.Stream] = []
 
@@ -146,11 +146,11 @@ class KernelRollout:
     # ------------------------------------------------------------------ inside
 
     def _record(self) -> None:
-        """Record the control step, unless it has been recorded with the same flags."""
-        flags = [actuator.flags() for actuator in self._rollout.robot.actuators.values()]
-        if flags == self._flags:
+        """Record the control step, unless it has been recorded with the same branches."""
+        branches = [actuator.branches() for actuator in self._rollout.robot.actuators.values()]
+        if branches == self._branches:
             return
-        self._flags, self._groups = flags, []
+        self._branches, self._groups = branches, []
         n, recordings = self._rollout.robot.num_joints, self._rollout.dataset.num_recordings
         for actuator in list(self._rollout.robot.actuators.values()):
             for rows in self._parts:
