@@ -249,11 +249,11 @@ class DelayBuffer(Part):
 
     def _index_lags(self) -> None:
         """Tabulate, for every head position, the rows of the two samples around each lag."""
-        self._total = lag = self._lag + self._lead
+        self._total = lag = self._lag + self._lead if self._lead else self._lag
         whole = lag.ceil() if self.interpolation == "hold" else lag.floor()
         self._fraction = torch.zeros_like(lag) if self.interpolation == "hold" else lag - whole
-        self._whole = not bool(self._fraction.any())
-        self._all_zero = not bool(lag.any())
+        self._whole = self.interpolation == "hold" or self._all(self._fraction == 0)
+        self._all_zero = self._all(lag == 0)
         self._newer, self._older = self._rows(whole), self._rows(whole + 1)
         self._index_parts()
 
@@ -268,12 +268,14 @@ class DelayBuffer(Part):
             left = self._total - part / self.parts
             back = left.ceil().clamp(min=0.0)
             weight = (self.parts * (1 + left - back)).clamp(max=1.0)
-            same = bool((weight == 1).all())
             newer = self._rows((back - 1).clamp(min=0.0))
-            self._at[part] = newer, self._rows(back), None if same else weight
-            if before is not None and not (torch.equal(before[0], back) and torch.equal(before[1], weight)):
+            self._at[part] = newer, self._rows(back), None if self._all(weight == 1) else weight
+            if before is not None and not self._all((before[0] == back) & (before[1] == weight)):
                 self._switches.add(part)
             before = back, weight
+
+    def _all(self, which: torch.Tensor) -> bool:
+        return bool(which.all())
 
     def _rows(self, steps: torch.Tensor) -> torch.Tensor:
         """What :meth:`_seen` takes for the samples so many steps back."""

@@ -51,9 +51,7 @@ class CommandRateLimit(Effect):
 
     def command(self, s: DriveState) -> None:
         """Follow the target at the limit; the first counts as reached."""
-        new = self.take_new_rows()
-        if new is not None:
-            self._target = torch.where(new, s.joint_pos_target, self._target)
+        self.begin(_target=s.joint_pos_target)
         error = s.joint_pos_target - self._target
         limited = self._target + error.clamp(-self._step, self._step)
         self._target = torch.where(error.abs() <= self._step, s.joint_pos_target, limited)
@@ -105,10 +103,7 @@ class CommandAccelerationLimit(Effect):
 
     def command(self, s: DriveState) -> None:
         """Follow the target on the profile; the first counts as reached."""
-        new = self.take_new_rows()
-        if new is not None:
-            self._target = torch.where(new, s.joint_pos_target, self._target)
-            self._speed = torch.where(new, 0.0, self._speed)
+        self.begin(_target=s.joint_pos_target, _speed=0.0)
         h, gain = self._h, self._gain
         for _ in range(self._steps):
             error = s.joint_pos_target - self._target
@@ -143,9 +138,7 @@ class CommandFilter(Effect):
 
     def command(self, s: DriveState) -> None:
         """Follow the command; the first counts as reached."""
-        new = self.take_new_rows()
-        if new is not None:
-            self._target = torch.where(new, s.joint_pos_target, self._target)
+        self.begin(_target=s.joint_pos_target)
         self._target = torch.lerp(self._target, s.joint_pos_target, self._weight)
         s.joint_pos_target = self._target
 
@@ -347,9 +340,7 @@ class IntegralGain(Effect):
 
     def controller_effort(self, s: DriveState) -> None:
         """Add the integral's torque; it begins empty."""
-        new = self.take_new_rows()
-        if new is not None:
-            self._integral = torch.where(new, 0.0, self._integral)
+        self.begin(_integral=0.0)
         summed = self._integral + self._per_step * s.position_error
         self._integral = torch.clamp(summed, -self.effort, self.effort)
         s.effort += self._integral

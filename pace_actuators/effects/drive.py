@@ -83,9 +83,7 @@ class TorqueFade(Effect):
 
     def drive(self, s: DriveState) -> None:
         """Scale the torque, and heat up by it."""
-        new = self.take_new_rows()
-        if new is not None:
-            self._heat = torch.where(new, self._first, self._heat)
+        self.begin(_heat=self._first)
         asked = s.effort.clone()
         left = (1.0 - self._heat * self._per_heat).clamp(min=self.least)
         s.effort *= left
@@ -154,9 +152,7 @@ class DriveBandwidth(Effect):
 
     def current_loop(self, s: DriveState) -> None:
         """Give the mean torque over the coming step; the first counts as settled."""
-        new = self.take_new_rows()
-        if new is not None:
-            self._torque = torch.where(new, s.effort, self._torque)
+        self.begin(_torque=s.effort)
         before, asked = self._torque, s.effort.clone()
         self._torque = torch.lerp(before, asked, self._weight)
         s.effort = torch.lerp(before, asked, self._mean_weight)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -324,11 +324,7 @@ class Effect(Part):
     def take_new_rows(self) -> torch.Tensor | None:
         """Which rows have no history yet, (rows, 1) bool, or ``None``: all at first, and those of a reset.
 
-        It says so once; the effect lets their history begin, most often with the first value that it sees::
-
-            new = self.take_new_rows()
-            if new is not None:
-                self._target = torch.where(new, s.joint_pos_target, self._target)
+        It says so once; the effect lets their history begin, most often by :meth:`begin`.
         """
         if self.new_rows is None or not self._on_device:
             new, self.new_rows = self.new_rows, None
@@ -336,6 +332,13 @@ class Effect(Part):
         new = self.new_rows.clone()  # a CUDA graph repeats it, with new rows or without
         self.new_rows.fill_(False)
         return new
+
+    def begin(self, **values: torch.Tensor | float) -> None:
+        """Let the history of rows that have none begin with these values, by the names of its memory."""
+        new = self.take_new_rows()
+        if new is not None:
+            for name, value in values.items():
+                setattr(self, name, torch.where(new, value, getattr(self, name)))
 
     def full(self, value: float) -> torch.Tensor:
         """A tensor of its shape (rows, num_joints)."""
@@ -430,6 +433,3 @@ def probe_points(effect: type[Effect]) -> list[dict[str, float]]:
 def off(value: torch.Tensor) -> torch.Tensor:
     """Where a parameter whose null is infinite is at it."""
     return torch.isinf(value)
-
-
-Effects = Sequence[Effect]

@@ -24,9 +24,7 @@ class _FadingFriction(Effect):
 
     def middle_speed(self, s: DriveState) -> torch.Tensor:
         """The speed in the middle of the step, as the last two let expect [rad/s]; once per step."""
-        new = self.take_new_rows()
-        if new is not None:
-            self._before = torch.where(new, s.motor_vel, self._before)
+        self.begin(_before=s.motor_vel)
         middle = 1.5 * s.motor_vel - 0.5 * self._before
         self._before = s.motor_vel.clone()
         return middle

@@ -87,9 +87,7 @@ class VelocityFilter(Effect):
 
     def sensed_velocity(self, s: DriveState) -> None:
         """Filter the speed; the first counts as settled."""
-        new = self.take_new_rows()
-        if new is not None:
-            self._seen = torch.where(new, s.encoder_vel, self._seen)
+        self.begin(_seen=s.encoder_vel)
         self._seen = torch.lerp(self._seen, s.encoder_vel, self._weight)
         s.encoder_vel = self._seen
         s.speed_slope *= self._weight

@@ -349,12 +349,7 @@ class EffectStack(Part):
     def _configure(self, effect: Effect, cfg: EffectCfg) -> None:
         names = cfg.joints(self._joint_names)
         joints = torch.tensor([self._joint_names.index(name) for name in names], device=self.state.time.device)
-        known = {parameter.name for parameter in effect.parameters}
         for name, value in cfg.values.items():
-            if name not in known:
-                raise ValueError(
-                    f"The effect {effect.name!r} has no parameter {name!r}. Available: {', '.join(sorted(known))}."
-                )
             values = resolve_joint_values(value, names, field=f"{effect.name}.{name}")
             effect.set_parameter(name, values, joints=joints)
         effect.prepare()

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import copy
-import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial, reduce
 from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
@@ -18,7 +18,7 @@ from pace_actuators.effects.drive_state import DriveState
 from pace_actuators.part import Part
 from pace_envs.compiled_drive.drive_code import Program, Read
 from pace_envs.compiler.operations import TYPES, UNARY, is_compared, rule
-from pace_envs.compiler.tape import Node, NotTraceableError, Ring, Tape
+from pace_envs.compiler.tape import Node, NotTraceableError, Tape
 from pace_envs.compiler.tracer import Tracer, tensors_in
 from pace_envs.mdp import JointPositionAction
 
@@ -234,7 +234,7 @@ def _promoted(args: Sequence[Any], tensors: Sequence[torch.Tensor]) -> torch.dty
         types.add(torch.get_default_dtype())
     if int in numbers and types == {torch.bool}:
         types.add(torch.int64)
-    return functools.reduce(torch.promote_types, types)
+    return reduce(torch.promote_types, types)
 
 
 class TracedDelay(DelayBuffer):
@@ -252,26 +252,22 @@ class TracedDelay(DelayBuffer):
         self._tracer, self._make_lag = tracer, lag
         self.ring: int | None = None
         """Index of its memory, once it is used."""
-        self._all_zero, self._whole = False, self.interpolation == "hold"
+        self._all_zero = False
 
     def compute(self, data: torch.Tensor) -> torch.Tensor:
         """As the delay's."""
         if self.ring is None:
-            self.ring = self._tracer.tape.ring(Ring(self._length, self.interpolation, self.parts))
-            self._note(self._make_lag())
+            self.ring = self._tracer.tape.ring(self._length)
+            self._lag, self._lead = self._make_lag(), 0.0
+            self._index_lags()
         self._tracer.keep(self.ring, data)
         return self.part(0) if self._at else self.mean()
 
-    def _note(self, lag: torch.Tensor) -> None:
-        self._newer = lag.ceil() if self._whole else lag.floor()
-        self._older, self._fraction = self._newer + 1.0, lag - self._newer
-        self._at = {}
-        for part in range(self.parts if self.parts > 1 and not self._whole else 0):
-            left = lag - part / self.parts
-            back = left.ceil().clamp(min=0.0)
-            weight = (self.parts * (1 + left - back)).clamp(max=1.0)
-            self._at[part] = (back - 1.0).clamp(min=0.0), back, weight
-        self._switches = set(self._at)
+    def _all(self, which: torch.Tensor) -> bool:
+        return False
+
+    def _rows(self, steps: torch.Tensor) -> torch.Tensor:
+        return steps
 
     def _seen(self, rows: torch.Tensor) -> torch.Tensor:
         if self.ring is None:
@@ -421,7 +417,9 @@ class OneJoint:
         if place not in self._known:
             kind = TYPES[value.dtype]
             entries = value.shape[2] if value.ndim == 3 else 1
-            tensor = self.leaf(lambda: self._numbers(true[key], begin, columns), kind, entries)
+            rows = slice(self.rows.start - begin, self.rows.stop - begin)
+            read = partial(_numbers, true, key, rows, columns, (len(self.rows), len(self.columns)))
+            tensor = self.leaf(read, kind, entries)
             self._known[place] = tensor, len(self.leaves) - 1
         holder[key], index = self._known[place]
         if value.ndim == 2:
@@ -449,8 +447,6 @@ class OneJoint:
             columns=self.columns,
         )
         self.tracer.forget()
-        for each in (self._known, self._after, self._delays, self._series, vars(self.robot), vars(self.drive)):
-            each.clear()
         return program
 
     # ------------------------------------------------------------------ inside
@@ -466,13 +462,6 @@ class OneJoint:
             if updates.setdefault(index, node) is not node:
                 raise NotTraceableError("tensors that shared their memory and do not any more")
         return {i: node for i, node in updates.items() if node is not leaves[i]}
-
-    def _numbers(self, tensor: torch.Tensor, begin: int, columns: torch.Tensor | None) -> torch.Tensor:
-        own = tensor[self.rows.start - begin : self.rows.stop - begin]
-        own = own if columns is None or own.shape[1] == 1 else own[:, columns]
-        if own.ndim == 3:
-            return own.permute(2, 0, 1)
-        return own.to(torch.float64).expand(len(self.rows), len(self.columns))[None]
 
     def _copied_drive(self) -> PaceDCMotor:
         actuator, stack = self._actuator, self._actuator.effects
@@ -525,6 +514,15 @@ class OneJoint:
 
 def _place(tensor: torch.Tensor) -> tuple:
     return tensor.data_ptr(), tensor.shape, tensor.dtype
+
+
+def _numbers(
+    true: Mapping, key: Any, rows: slice, columns: torch.Tensor | None, shape: tuple[int, int]
+) -> torch.Tensor:
+    """What a tensor now holds of some rows and joints, (entries, *shape)."""
+    own = true[key][rows]
+    own = own if columns is None or own.shape[1] == 1 else own[:, columns]
+    return own.permute(2, 0, 1) if own.ndim == 3 else own.to(torch.float64).expand(shape)[None]
 
 
 def commands(env: ManagerBasedEnv, dataset: Commands, name: str) -> torch.Tensor:

@@ -6,13 +6,14 @@ import contextlib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import torch
 
 from pace_envs.compiled_drive.drive_code import Program
 from pace_envs.compiled_drive.joint_source import joint_source
 from pace_envs.compiled_drive.one_joint import HELD, commands
+from pace_envs.compiler.fusion import Compiler
 from pace_optim.joints.simulation.kernel_recorder import record
 from pace_optim.problem.rollout import between_steps
 
@@ -22,16 +23,6 @@ if TYPE_CHECKING:
 _OF_RECORDINGS = ("command", "command_vel", "command_effort", "torque_enable")
 _WIDTH = 32
 """Threads of a block: each goes its way alone, and few blocks spread over the GPU."""
-
-
-class Compiler(Protocol):
-    """Compiles and launches kernels: see :class:`~pace_envs.compiler.Kernels`."""
-
-    def compile(self, sources: Sequence[str]) -> None:
-        """Compile those that are new."""
-
-    def launch(self, source: str, threads: int, width: int, arguments: Sequence[int | torch.Tensor]) -> None:
-        """Queue one."""
 
 
 @dataclass(kw_only=True)
