@@ -464,18 +464,17 @@ class OneJoint:
         return {i: node for i, node in updates.items() if node is not leaves[i]}
 
     def _copied_drive(self) -> PaceDCMotor:
-        actuator, stack = self._actuator, self._actuator.effects
-        drive: PaceDCMotor = self._copied(actuator)
-        drive._num_envs, drive._joint_names, drive._joint_indices = 1, actuator.joint_names[:1], slice(None)
-        drive._delays, drive.effects = copy.copy(actuator._delays), None
-        drive._delays.buffers = self._traced(actuator._delays.buffers)
-        acting = {} if stack is None else self._acting(stack.effects)
-        if stack is not None and acting:
+        actuator, stack, effects = self._actuator, self._actuator.effects, None
+        if stack is not None and (acting := self._acting(stack.effects)):
             state = self._state(stack.state, [stack.views[effect] for effect in acting])
             twins = [self._copied(effect, begin) for effect, begin in acting.items()]
             for twin, (effect, begin) in zip(twins, acting.items(), strict=True):
                 twin.shape, twin.rows, twin.buffers = (1, 1), slice(None), self._traced(effect.buffers, begin)
-            drive.effects = stack.of(twins, state)
+            effects = stack.of(twins, state)
+        drive: PaceDCMotor = self._copied(actuator)
+        drive._num_envs, drive._joint_names, drive._joint_indices = 1, actuator.joint_names[:1], slice(None)
+        drive._delays, drive.effects = copy.copy(actuator._delays), effects
+        drive._delays.buffers = self._traced(actuator._delays.buffers)
         return drive
 
     def _acting(self, effects: Sequence[Effect]) -> dict[Effect, int]:
