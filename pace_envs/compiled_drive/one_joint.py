@@ -493,10 +493,10 @@ class OneJoint:
     def _state(self, state: DriveState, views: Sequence[DriveState]) -> DriveState:
         """What stands for a drive's state, and for what is seen of it through its views."""
         twin: dict[str, torch.Tensor] = {}
-        for name, tensor in state.tensors().items():
-            self.replace(twin, {name: tensor}, name)
-            seen = [view.tensors().get(name) for view in views]
-            self._known |= {_place(each): self._known[_place(tensor)] for each in seen if each is not None}
+        true, seen = state.tensors(), [view.tensors() for view in views]
+        for name, tensor in true.items():
+            self.replace(twin, true, name)
+            self._known |= {_place(each[name]): self._known[_place(tensor)] for each in seen if name in each}
         return DriveState(twin)
 
     def _traced(self, buffers: Mapping[str, DelayBuffer], begin: int = 0) -> dict[str, DelayBuffer]:
