@@ -251,10 +251,10 @@ class DelayBuffer(Part):
         """Tabulate, for every head position, the rows of the two samples around each lag."""
         self._total = lag = self._lag + self._lead if self._lead else self._lag
         whole = lag.ceil() if self.interpolation == "hold" else lag.floor()
+        self._newer, self._older = self._rows(whole), self._rows(whole + 1)
         self._fraction = torch.zeros_like(lag) if self.interpolation == "hold" else lag - whole
         self._whole = self.interpolation == "hold" or self._all(self._fraction == 0)
         self._all_zero = self._all(lag == 0)
-        self._newer, self._older = self._rows(whole), self._rows(whole + 1)
         self._index_parts()
 
     def _index_parts(self) -> None:

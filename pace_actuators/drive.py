@@ -47,7 +47,17 @@ class Drive(Part):
     is_implicit_model = False
     memory: ClassVar[Sequence[str]] = (
         *("computed_effort", "motor_effort", "applied_effort", "_held_effort", "_speed_slope", "_loop_slope"),
-        *("_calls_until_control", "_run", "_renewed", "_any_renewed", "_alone", "_since_run", "_held_pos", "_held_vel"),
+        *(
+            "_calls_until_control",
+            "_run",
+            "_jump",
+            "_renewed",
+            "_any_renewed",
+            "_alone",
+            "_since_run",
+            "_held_pos",
+            "_held_vel",
+        ),
     )
 
     def __init__(
@@ -206,20 +216,18 @@ class Drive(Part):
 
         The controller of a drive that is reset runs at the next call, also where the others hold their torque.
         """
-        self._delays.reset(env_ids)
+        chosen = None if env_ids is None else self._mask(env_ids)
+        self._delays.reset(chosen)
         if self._own_dt is not None:
-            self._since_run[slice(None) if env_ids is None else env_ids] = self._own_dt
-        if env_ids is None:
+            self._since_run[slice(None) if chosen is None else chosen] = self._own_dt
+        if chosen is None:
             self._calls_until_control = 0
             self._any_renewed = False
         elif self._calls_until_control:
-            if isinstance(env_ids, torch.Tensor) and env_ids.dtype == torch.bool:
-                self._renewed |= env_ids[:, None]
-            else:
-                self._renewed[env_ids] = True
+            self._renewed |= chosen[:, None]
             self._any_renewed = True
         if self.effects is not None:
-            self.effects.reset(env_ids)
+            self.effects.reset(chosen)
 
     def update_encoder_bias(self, encoder_bias: torch.Tensor | float, env_ids: EnvIds = None) -> None:
         """Set the encoder bias [rad], (len(env_ids), num_joints) or broadcastable to it.
@@ -254,7 +262,8 @@ class Drive(Part):
         """Say how the simulator moves positions, and what it holds between two calls: see the attributes."""
         self.holds_line, self.is_trapezoidal = holds_line, is_trapezoidal
         if self.effects is not None:
-            self.effects.is_trapezoidal = is_trapezoidal
+            for effect in self.effects.effects:
+                effect.is_trapezoidal = is_trapezoidal
         self._delays.set_lead(self._lead)
 
     @property
@@ -468,6 +477,14 @@ class Drive(Part):
             effect.notice(conditions)
 
     # ---- inside --------------------------------------------------------------------------------------------------
+
+    def _mask(self, env_ids: Sequence[int] | torch.Tensor | slice) -> torch.Tensor:
+        """Environments, by index or already a mask, as (num_envs,) bool."""
+        if isinstance(env_ids, torch.Tensor) and env_ids.dtype == torch.bool:
+            return env_ids
+        chosen = torch.zeros(self._num_envs, dtype=torch.bool, device=self._device)
+        chosen[env_ids] = True
+        return chosen
 
     def _check_shapes(self, **given: torch.Tensor | None) -> None:
         """Refuse what has not a row per environment and a column per joint: torch would spread it without a word."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,7 +11,6 @@ import torch
 from pace_actuators.dc_motor import clip_to_line, pd_effort
 from pace_actuators.delay_buffer import Jump
 from pace_actuators.drive import ControllerRun, Drive
-from pace_actuators.drive_delays import DriveDelays
 
 
 class PaceDCMotor(Drive):
@@ -195,13 +193,12 @@ class PaceDCMotor(Drive):
 
         Nothing of the others changes. A delay shows the present command, as after any reset.
         """
-        new = copy.copy(self)
-        new._delays = DriveDelays((), 0.0, self._num_envs, self._device, "linear", runs=1, parts=1)
+        own = self.snapshot()
+        self.reset()
         if self.effects is not None:
-            new.effects = copy.deepcopy(self.effects)
-            new.effects.reset(None)
-            new.effects.begin_step(joint_pos, joint_vel)
-        effort = new.compute_effort_command(control_action, joint_pos, joint_vel)
+            self.effects.begin_step(joint_pos, joint_vel)
+        effort = self.compute_effort_command(control_action, joint_pos, joint_vel)
+        self.restore(own)
         others = torch.full_like(effort, torch.nan) if self._alone is None else self._alone
         return torch.where(self._renewed, effort, others)
 

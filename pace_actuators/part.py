@@ -27,4 +27,5 @@ class Part:
 
     def flags(self) -> dict[str, Hashable]:
         """What Python branches over, by attribute: numbers, names, sets of names, and what is ``None``."""
-        return {name: value for name, value in vars(self).items() if isinstance(value, _PLAIN)}
+        own = getattr(self, "__dict__", {})  # a drive's state has fields alone
+        return {name: value for name, value in own.items() if isinstance(value, _PLAIN)}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Hashable, Sequence
 
 import torch
 
@@ -78,7 +77,8 @@ class DriveState(Part):
     held_pos: torch.Tensor
     held_vel: torch.Tensor
 
-    __slots__ = tuple(f"_{name}" for name in __annotations__)
+    memory = tuple(__annotations__)
+    __slots__ = tuple(f"_{name}" for name in memory)
 
     def __init__(self, fields: dict[str, torch.Tensor]):
         """Keep the tensors of the fields."""
@@ -106,17 +106,9 @@ class DriveState(Part):
             raise AttributeError(f"{name} is not computed for this effect: declare {flag} = True in its class.")
         raise AttributeError(f"The drive's state has no {name!r}. Available: {', '.join(_FIELDS)}.")
 
-    def kept(self) -> Sequence[str]:
-        """All fields."""
-        return _FIELDS
-
     def tensors(self) -> dict[str, torch.Tensor]:
         """All fields, but those of load and link where they are not wanted."""
         return {name: getattr(self, name) for name in _FIELDS if hasattr(self, name)}
-
-    def flags(self) -> dict[str, Hashable]:
-        """None."""
-        return {}
 
 
 def _field(name: str) -> property:
@@ -131,6 +123,6 @@ def _field(name: str) -> property:
     return property(read, write)
 
 
-_FIELDS = tuple(DriveState.__annotations__)
+_FIELDS = DriveState.memory
 for _name in _FIELDS:
     setattr(DriveState, _name, _field(_name))

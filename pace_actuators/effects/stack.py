@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 
@@ -67,7 +67,6 @@ class EffectStack(Part):
         Raises:
             ValueError: If joints or values do not fit.
         """
-        self._is_trapezoidal = False
         self.state = DriveState.zeros(num_envs, len(joint_names), device, dtype)
         self.state.enabled.fill_(1.0)
         self._joint_names = list(joint_names)
@@ -115,17 +114,6 @@ class EffectStack(Part):
         self.needs_link = any(effect.reads_link for effect in self.effects)
         """Whether the inertia of what the joints carry must be given."""
 
-    @property
-    def is_trapezoidal(self) -> bool:
-        """Whether the simulator moves positions with the mean of the old and the new speed."""
-        return self._is_trapezoidal
-
-    @is_trapezoidal.setter
-    def is_trapezoidal(self, value: bool) -> None:
-        self._is_trapezoidal = value
-        for effect in self.effects:
-            effect.is_trapezoidal = value
-
     def has(self, stage: str) -> bool:
         """Whether an effect acts at a stage."""
         return bool(self._at[stage])
@@ -155,22 +143,13 @@ class EffectStack(Part):
             f"The drive has no effect {name!r}. It has: {', '.join(e.name for e in self.effects) or 'none'}."
         )
 
-    def reset(self, env_ids: Any = None) -> None:
-        """Forget the history of all or some environments."""
+    def reset(self, chosen: torch.Tensor | None = None) -> None:
+        """Forget the history of all environments, or of some, (num_envs,) bool."""
         self._step_begun = False
-        if env_ids is None:
-            for effect in self.effects:
-                effect.reset_state(slice(None))
-            return
-        if isinstance(env_ids, torch.Tensor) and env_ids.dtype == torch.bool:
-            chosen = env_ids
-        else:
-            chosen = torch.zeros(self._num_envs, dtype=torch.bool, device=self.state.time.device)
-            chosen[env_ids] = True
         for effect in self.effects:
-            own = chosen[effect.rows]
-            if own.is_cuda or bool(own.any()):  # a GPU is not waited for
-                effect.reset_state(own)
+            own = None if chosen is None else chosen[effect.rows]
+            if own is None or own.is_cuda or bool(own.any()):  # a GPU is not waited for
+                effect.reset_state(slice(None) if own is None else own)
 
     def take_over(self, armature: torch.Tensor, friction: torch.Tensor, viscous_friction: torch.Tensor) -> None:
         """Take over changed parameters of the base model, (num_envs, num_joints) each, and of the effects."""

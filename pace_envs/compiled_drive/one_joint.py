@@ -112,14 +112,6 @@ class JointTracer(Tracer):
         """Let a tensor stand for another number, of its type."""
         self._nodes[tensor.data_ptr()] = self.tape.cast(node, TYPES[tensor.dtype])
 
-    def keep(self, ring: int, sample: torch.Tensor) -> None:
-        """Put a sample into a ring."""
-        self.tape.new("push", self.node(sample, "double"), index=ring)
-
-    def seen(self, ring: int, back: torch.Tensor) -> torch.Tensor:
-        """The sample of so many pushes ago, whole numbers in a double."""
-        return self.tensor(self.tape.new("ring", self.node(back), index=ring))
-
     # ------------------------------------------------------------------ what torch asks
 
     def made(self, func: Any, name: str, args: tuple, kwargs: dict[str, Any]) -> Any:
@@ -260,7 +252,7 @@ class TracedDelay(DelayBuffer):
             self.ring = self._tracer.tape.ring(self._length)
             self._lag, self._lead = self._make_lag(), 0.0
             self._index_lags()
-        self._tracer.keep(self.ring, data)
+        self._tracer.tape.new("push", self._tracer.node(data, "double"), index=self.ring)
         return self.part(0) if self._at else self.mean()
 
     def _all(self, which: torch.Tensor) -> bool:
@@ -272,7 +264,7 @@ class TracedDelay(DelayBuffer):
     def _seen(self, rows: torch.Tensor) -> torch.Tensor:
         if self.ring is None:
             raise NotTraceableError("a delay that is read before it has a sample")
-        return self._tracer.seen(self.ring, rows)
+        return self._tracer.tensor(self._tracer.tape.new("ring", self._tracer.node(rows), index=self.ring))
 
 
 class OneJoint:

@@ -13,7 +13,7 @@ import torch
 from pace_envs.compiled_drive.drive_code import Program
 from pace_envs.compiled_drive.joint_source import joint_source
 from pace_envs.compiled_drive.one_joint import HELD, commands
-from pace_envs.compiler.fusion import Compiler
+from pace_envs.compiler import Compiler
 from pace_optim.joints.simulation.kernel_recorder import record
 from pace_optim.problem.rollout import between_steps
 
