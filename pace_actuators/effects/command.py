@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
@@ -23,7 +22,7 @@ class CommandRateLimit(Effect):
 
     name = "command_rate_limit"
     stage = "command"
-    memory: ClassVar[Mapping[str, float]] = {"_target": 0.0}
+    memory = ("_target",)
     _target: torch.Tensor
     parameters = (
         EffectParameter(
@@ -69,7 +68,7 @@ class CommandAccelerationLimit(Effect):
 
     name = "command_acceleration_limit"
     stage = "command"
-    memory: ClassVar[Mapping[str, float]] = {"_target": 0.0, "_speed": 0.0}
+    memory = ("_target", "_speed")
     _target: torch.Tensor
     _speed: torch.Tensor
     parameters = (
@@ -121,7 +120,7 @@ class CommandFilter(Effect):
 
     name = "command_filter"
     stage = "command"
-    memory: ClassVar[Mapping[str, float]] = {"_target": 0.0}
+    memory = ("_target",)
     _target: torch.Tensor
     parameters = (EffectParameter(name="time_constant", unit="s", lower=0.0, upper=0.2, null=0.0, start=0.01),)
     equation = "T dx/dt + x = q*, the controller follows x"
@@ -269,7 +268,7 @@ class FastLoop(Effect):
 
     name = "fast_loop"
     stage = "controller"
-    memory: ClassVar[Mapping[str, float]] = {"_seen": 0.0, "_speed": 0.0}
+    memory = ("_seen", "_speed")
     _seen: torch.Tensor
     _speed: torch.Tensor
     parameters = (
@@ -310,7 +309,7 @@ class IntegralGain(Effect):
 
     name = "integral_gain"
     stage = "controller"
-    memory: ClassVar[Mapping[str, float]] = {"_integral": 0.0}
+    memory = ("_integral",)
     _integral: torch.Tensor
     parameters = (
         EffectParameter(name="gain", unit="N m/(rad s)", lower=0.0, upper=1000.0, null=0.0, start=10.0, meaning="ki"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
@@ -45,7 +44,7 @@ class TorqueFade(Effect):
 
     name = "torque_fade"
     stage = "drive"
-    memory: ClassVar[Mapping[str, float]] = {"_heat": 0.0, "_first": 0.0}
+    memory = ("_heat", "_first")
     _heat: torch.Tensor
     _first: torch.Tensor
     parameters = (
@@ -133,7 +132,7 @@ class DriveBandwidth(Effect):
 
     name = "drive_bandwidth"
     stage = "drive"
-    memory: ClassVar[Mapping[str, float]] = {"_torque": 0.0}
+    memory = ("_torque",)
     _torque: torch.Tensor
     parameters = (EffectParameter(name="time_constant", unit="s", lower=0.0, upper=0.03, null=0.0, start=0.002),)
     equation = "T dτ/dt + τ = clip(τ_cmd, ± τ_c)"
@@ -252,7 +251,7 @@ class TorqueSpeedLimit(Effect):
 
     name = "torque_speed_limit"
     stage = "drive"
-    memory: ClassVar[Mapping[str, float]] = {"_speed": 0.0}
+    memory = ("_speed",)
     _speed: torch.Tensor
     parameters = (
         EffectParameter(

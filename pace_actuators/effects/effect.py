@@ -157,9 +157,9 @@ class Effect(Part):
     """What a person would see in the data."""
     source: ClassVar[str] = ""
     """Where the equation comes from."""
-    memory: ClassVar[Mapping[str, float]] = {}
-    """What it keeps from step to step: attributes (rows, num_joints) by name, with the value that they begin with. A
-    step assigns new tensors to them."""
+    memory: ClassVar[Collection[str]] = ()
+    """What it keeps from step to step: names of attributes (rows, num_joints), which begin with zero, or in a dict with
+    the value that they begin with. A step assigns new tensors to them."""
     probes: ClassVar[tuple[Mapping[str, float], ...]] = ()
     """Small values at which a screening looks at it; parameters left out are at their start."""
     structural: ClassVar[str] = ""
@@ -237,8 +237,8 @@ class Effect(Part):
         for parameter in self.parameters:
             value = parameter.start if parameter.null is None else parameter.null
             setattr(self, parameter.name, self.full(value))
-        for name, value in self.memory.items():
-            setattr(self, name, self.full(value))
+        for name in self.memory:
+            setattr(self, name, self.full(self.memory[name] if isinstance(self.memory, Mapping) else 0.0))
         self.prepare()
 
     # ---- what a subclass overrides -------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
@@ -18,7 +17,7 @@ class _FadingFriction(Effect):
     stage = "friction"
     two_sided = False
     smooths_friction = True
-    memory: ClassVar[Mapping[str, float]] = {"_before": 0.0}
+    memory = ("_before",)
     _before: torch.Tensor
     separates = "a staircase that holds each of its steps longer, and a slow triangle"
 

@@ -6,8 +6,6 @@ The simulator applies Coulomb friction itself, so that a stuck joint sticks; an 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import ClassVar
 
 import torch
 
@@ -192,7 +190,7 @@ class PreslidingFriction(Effect):
 
     name = "presliding_friction"
     stage = "friction"
-    memory: ClassVar[Mapping[str, float]] = {"_bristle": 0.0, "_position": 0.0}
+    memory = ("_bristle", "_position")
     _bristle: torch.Tensor
     _position: torch.Tensor
     parameters = (
