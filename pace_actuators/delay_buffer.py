@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Hashable, Sequence
-from typing import ClassVar, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 
@@ -48,7 +48,7 @@ class DelayBuffer(Part):
     CUDA graph repeats a step, and nothing is counted in Python.
     """
 
-    memory: ClassVar[Sequence[str]] = ("_storage", "_head", "_stale", "_any_stale", "_row", "_age")
+    memory = ("_storage", "_head", "_stale", "_any_stale", "_row", "_age")
 
     def __init__(
         self,

@@ -8,7 +8,7 @@ import math
 import re
 import warnings
 from collections.abc import Hashable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 
@@ -45,19 +45,9 @@ class Drive(Part):
     """The numbers, delays and effects of a group of joints' drives; the law is :class:`PaceDCMotor`'s."""
 
     is_implicit_model = False
-    memory: ClassVar[Sequence[str]] = (
-        *("computed_effort", "motor_effort", "applied_effort", "_held_effort", "_speed_slope", "_loop_slope"),
-        *(
-            "_calls_until_control",
-            "_run",
-            "_jump",
-            "_renewed",
-            "_any_renewed",
-            "_alone",
-            "_since_run",
-            "_held_pos",
-            "_held_vel",
-        ),
+    memory = (
+        *("computed_effort", "motor_effort", "applied_effort", "_held_effort", "_speed_slope", "_loop_slope", "_jump"),
+        *("_calls_until_control", "_run", "_renewed", "_any_renewed", "_alone", "_since_run", "_held_pos", "_held_vel"),
     )
 
     def __init__(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar, TypeVar
+from typing import TypeVar
 
 import torch
 
@@ -21,7 +21,7 @@ class DriveDelays(Part):
     as the first one.
     """
 
-    memory: ClassVar[Sequence[str]] = ("_silent",)
+    memory = ("_silent",)
 
     def __init__(
         self,

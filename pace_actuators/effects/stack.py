@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import ClassVar
 
 import torch
 
@@ -38,7 +37,7 @@ _STAGES = (
 class EffectStack(Part):
     """Holds a drive's effects and the state that they share."""
 
-    memory: ClassVar[Sequence[str]] = ("_step_begun",)
+    memory = ("_step_begun",)
 
     def __init__(
         self,
