@@ -22,7 +22,7 @@ CALLS = 40
 def drives(rows_each: int, device: str) -> tuple[PaceDCMotor, int]:
     """Drives whose effects act on so many rows each, and all rows."""
     every = [get_effect(name) for name in available_effects()]
-    tried = [effect for effect in every if not effect.free_form and not effect.special_case_of]
+    tried = [effect for effect in every if not effect.free_form]
     effects = [
         EffectCfg(effect=effect.name, env_rows=slice(rows_each * (i + 1), rows_each * (i + 2)))
         for i, effect in enumerate(tried)

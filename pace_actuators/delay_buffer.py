@@ -1,12 +1,13 @@
 """A delay of a real number of steps, one per environment."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from typing import Literal, NamedTuple
 
 import torch
 
 from pace_actuators.memory import check_memory
+from pace_actuators.part import Part
 
 Interpolation = Literal["linear", "hold"]
 
@@ -26,7 +27,7 @@ class Jump(NamedTuple):
     """The part of the time that is before the change, (num_envs, 1 or num_joints)."""
 
 
-class DelayBuffer:
+class DelayBuffer(Part):
     """Delays a batched signal (num_envs, num_joints) by a separate time lag for every environment.
 
     With the lag d = i + f (i whole steps, f the fraction), the output at step k is
@@ -46,6 +47,8 @@ class DelayBuffer:
     On a GPU, where the buffer is in the ring and how old its history is are tensors, one number per environment: a
     CUDA graph repeats a step, and nothing is counted in Python.
     """
+
+    memory = ("_storage", "_head", "_stale", "_any_stale", "_row", "_age")
 
     def __init__(
         self,
@@ -136,6 +139,10 @@ class DelayBuffer:
                 "environments, with one column for all joints or one per joint."
             ) from None
         self._index_lags()
+
+    def flags(self) -> dict[str, Hashable]:
+        """None: it counts, and what it does is the same."""
+        return {}
 
     def set_lead(self, lead: float) -> None:
         """Say by how much the simulator lets what it gets act too early [steps], 0 to 0.5: it is added to all lags."""
@@ -242,12 +249,12 @@ class DelayBuffer:
 
     def _index_lags(self) -> None:
         """Tabulate, for every head position, the rows of the two samples around each lag."""
-        self._total = lag = self._lag + self._lead
+        self._total = lag = self._lag + self._lead if self._lead else self._lag
         whole = lag.ceil() if self.interpolation == "hold" else lag.floor()
-        self._fraction = torch.zeros_like(lag) if self.interpolation == "hold" else lag - whole
-        self._whole = not bool(self._fraction.any())
-        self._all_zero = not bool(lag.any())
         self._newer, self._older = self._rows(whole), self._rows(whole + 1)
+        self._fraction = torch.zeros_like(lag) if self.interpolation == "hold" else lag - whole
+        self._whole = self.interpolation == "hold" or self._all(self._fraction == 0)
+        self._all_zero = self._all(lag == 0)
         self._index_parts()
 
     def _index_parts(self) -> None:
@@ -261,12 +268,14 @@ class DelayBuffer:
             left = self._total - part / self.parts
             back = left.ceil().clamp(min=0.0)
             weight = (self.parts * (1 + left - back)).clamp(max=1.0)
-            same = bool((weight == 1).all())
             newer = self._rows((back - 1).clamp(min=0.0))
-            self._at[part] = newer, self._rows(back), None if same else weight
-            if before is not None and not (torch.equal(before[0], back) and torch.equal(before[1], weight)):
+            self._at[part] = newer, self._rows(back), None if self._all(weight == 1) else weight
+            if before is not None and not self._all((before[0] == back) & (before[1] == weight)):
                 self._switches.add(part)
             before = back, weight
+
+    def _all(self, which: torch.Tensor) -> bool:
+        return bool(which.all())
 
     def _rows(self, steps: torch.Tensor) -> torch.Tensor:
         """What :meth:`_seen` takes for the samples so many steps back."""

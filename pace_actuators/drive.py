@@ -2,149 +2,30 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 import re
 import warnings
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any
 
 import torch
 
-from pace_actuators.base_parameters import CARRIED
-from pace_actuators.delay_buffer import DelayBuffer, Jump
+from pace_actuators.delay_buffer import Jump
 from pace_actuators.drive_delays import DriveDelays
 from pace_actuators.effects import EffectCfg, EffectStack, effect_cfgs
+from pace_actuators.effects.effect import Conditions, Heat
 from pace_actuators.identified import delay_in_steps, step_notes
-from pace_actuators.joint_values import JointValue, resolve_joint_values
-from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
-
-if TYPE_CHECKING:
-    from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
-
-
-def calls_per_run(cfg: PaceDCMotorCfg, physics_dt: float | None) -> int | None:
-    """Calls of a drive (physics steps) from one run of its controller to the next.
-
-    Args:
-        cfg: The drive.
-        physics_dt: Time between two of its calls [s].
-
-    Returns:
-        The calls; ``None`` where runs do not fall on the same calls of every control step: the drive then keeps its
-        own clock.
-
-    Raises:
-        ValueError: If its own rate is higher than that of the physics, or that of the physics is not known.
-    """
-    if cfg.implicit:
-        return 1
-    if cfg.drive_dt is None:
-        return cfg.control_decimation
-    if physics_dt is None:
-        raise ValueError(
-            f"The drive states its rate (drive_dt = {cfg.drive_dt:g} s), and the time between two calls is not "
-            "known: set physics_dt [s] in the actuator's configuration."
-        )
-    if not cfg.drive_dt > physics_dt * (1 - 1e-6):
-        raise ValueError(
-            f"drive_dt is {cfg.drive_dt:g} s and the physics step {physics_dt:g} s: expected at least a physics step "
-            f"in drive_dt. Make the physics step finer (--physics_dt {cfg.drive_dt:g} where a command has it, else "
-            "sim.dt), or change drive_dt."
-        )
-    calls = round(cfg.drive_dt / physics_dt)
-    fits = abs(calls * physics_dt - cfg.drive_dt) < 1e-9 and cfg.control_decimation % calls == 0
-    return calls if fits else None
-
-
-_NOT_NEGATIVE = (lambda x: (x >= 0) & x.isfinite(), "a finite number >= 0")
-_DOMAINS: dict[str, tuple[Callable[[torch.Tensor], torch.Tensor], str]] = {
-    "stiffness": _NOT_NEGATIVE,
-    "damping": _NOT_NEGATIVE,
-    **dict.fromkeys(CARRIED, _NOT_NEGATIVE),
-    "saturation_effort": (
-        lambda x: (x >= 0) & x.isfinite(),
-        "a finite number >= 0, or None for no torque-speed curve",
-    ),
-    "effort_limit": (lambda x: x >= 0, "a number >= 0, or inf"),
-    "velocity_limit": (lambda x: x > 0, "a number > 0, or inf"),
-    "encoder_bias": (torch.isfinite, "a finite number"),
-}
-"""Which values a field of the configuration may have, and how to say so."""
-
-
-class DriveParameters:
-    """Makes tensors (num_envs, num_joints) of a configuration's values."""
-
-    def __init__(
-        self,
-        cfg: PaceDCMotorCfg,
-        joint_names: Sequence[str],
-        num_envs: int,
-        device: torch.device,
-        dtype: torch.dtype,
-    ):
-        """Check the choices that are no numbers.
-
-        Raises:
-            ValueError: If one of them is unknown.
-        """
-        self._cfg = cfg
-        self._joint_names = list(joint_names)
-        self._shape = (num_envs, len(self._joint_names))
-        self._device, self._dtype = device, dtype
-        if cfg.delay_mode not in ("command", "effort"):
-            raise ValueError(f"Unknown delay_mode {cfg.delay_mode!r}. Available: 'command', 'effort'.")
-        if not (isinstance(cfg.control_decimation, int) and cfg.control_decimation >= 1):
-            raise ValueError(f"control_decimation is {cfg.control_decimation!r}, expected an integer >= 1.")
-        if cfg.implicit and cfg.drive_dt is not None:
-            raise ValueError(
-                f"The drive's controller is implicit, it runs continuously, and drive_dt is {cfg.drive_dt:g} s. "
-                "Leave out one of the two."
-            )
-        if cfg.implicit and cfg.delay_mode == "effort":
-            raise ValueError(
-                "The drive's controller is implicit, it acts at once, and delay_mode 'effort' would delay its torque. "
-                "Set implicit to False, with a drive_dt, or delay_mode to 'command'."
-            )
-
-    def read(self, field: str, default: torch.Tensor | float) -> torch.Tensor:
-        """A field's values; the default where the configuration says ``None``.
-
-        Raises:
-            ValueError: If a value lies outside the field's domain, or their number is wrong.
-        """
-        value: JointValue | None = getattr(self._cfg, field)
-        if value is None:
-            result = self.tensor(default, field)
-        else:
-            result = self.tensor(resolve_joint_values(value, self._joint_names, field=field), field)
-        valid, expected = _DOMAINS[field]
-        bad = ~valid(result)
-        if bool(bad.any()):
-            joint = self._joint_names[int(bad.any(dim=0).nonzero()[0])]
-            raise ValueError(f"{field} of {joint} is {result[bad][0].item():g}, expected {expected}.")
-        return result
-
-    def tensor(self, value: torch.Tensor | float, field: str) -> torch.Tensor:
-        """Values spread over environments and joints.
-
-        Raises:
-            ValueError: If their number is wrong.
-        """
-        tensor = torch.as_tensor(value, dtype=self._dtype, device=self._device)
-        try:
-            return tensor.expand(self._shape).clone()
-        except RuntimeError:
-            raise ValueError(
-                f"{field} has shape {tuple(tensor.shape)}, expected a number, ({self._shape[1]},) or {self._shape}."
-            ) from None
-
+from pace_actuators.pace_dc_motor_cfg import DriveParameters, PaceDCMotorCfg, calls_per_run
+from pace_actuators.part import Part
 
 EnvIds = Sequence[int] | torch.Tensor | slice | None
 
 _ROUNDING = 1e-3
 """Of a period: by so much a run may come early, as sums of steps are rounded."""
+_INVERSION_STEPS = 6
+"""Fixed-point steps to invert an encoder's error: it is small, each step divides what is left by ten or more."""
 
 
 @dataclasses.dataclass
@@ -160,10 +41,14 @@ class ControllerRun:
     added: torch.Tensor | None = None
 
 
-class Drive:
+class Drive(Part):
     """The numbers, delays and effects of a group of joints' drives; the law is :class:`PaceDCMotor`'s."""
 
     is_implicit_model = False
+    memory = (
+        *("computed_effort", "motor_effort", "applied_effort", "_held_effort", "_speed_slope", "_loop_slope", "_jump"),
+        *("_calls_until_control", "_run", "_renewed", "_any_renewed", "_alone", "_since_run", "_held_pos", "_held_vel"),
+    )
 
     def __init__(
         self,
@@ -254,9 +139,8 @@ class Drive:
         calls = calls_per_run(cfg, dt)
         self._own_dt = cfg.drive_dt if calls is None else None
         self._calls_per_run = calls = calls or 1
-        if self._own_dt is not None:
-            self._since_run = torch.full_like(self.stiffness, self._own_dt)
-            self._held_pos, self._held_vel = torch.zeros_like(self.stiffness), torch.zeros_like(self.stiffness)
+        self._since_run = torch.full_like(self.stiffness, self._own_dt or 0.0)
+        self._held_pos, self._held_vel = torch.zeros_like(self.stiffness), torch.zeros_like(self.stiffness)
         self._delays = DriveDelays(
             delayed,
             max_delay,
@@ -322,20 +206,18 @@ class Drive:
 
         The controller of a drive that is reset runs at the next call, also where the others hold their torque.
         """
-        self._delays.reset(env_ids)
+        chosen = None if env_ids is None else self._mask(env_ids)
+        self._delays.reset(chosen)
         if self._own_dt is not None:
-            self._since_run[slice(None) if env_ids is None else env_ids] = self._own_dt
-        if env_ids is None:
+            self._since_run[slice(None) if chosen is None else chosen] = self._own_dt
+        if chosen is None:
             self._calls_until_control = 0
             self._any_renewed = False
         elif self._calls_until_control:
-            if isinstance(env_ids, torch.Tensor) and env_ids.dtype == torch.bool:
-                self._renewed |= env_ids[:, None]
-            else:
-                self._renewed[env_ids] = True
+            self._renewed |= chosen[:, None]
             self._any_renewed = True
         if self.effects is not None:
-            self.effects.reset(env_ids)
+            self.effects.reset(chosen)
 
     def update_encoder_bias(self, encoder_bias: torch.Tensor | float, env_ids: EnvIds = None) -> None:
         """Set the encoder bias [rad], (len(env_ids), num_joints) or broadcastable to it.
@@ -370,7 +252,8 @@ class Drive:
         """Say how the simulator moves positions, and what it holds between two calls: see the attributes."""
         self.holds_line, self.is_trapezoidal = holds_line, is_trapezoidal
         if self.effects is not None:
-            self.effects.is_trapezoidal = is_trapezoidal
+            for effect in self.effects.effects:
+                effect.is_trapezoidal = is_trapezoidal
         self._delays.set_lead(self._lead)
 
     @property
@@ -398,26 +281,200 @@ class Drive:
             given = self.effects.state.enabled
             given.copy_(torch.ones_like(given) if self.torque_enable is None else self.torque_enable.expand_as(given))
 
-    def parts(self) -> list[Any]:
-        """The objects that keep something from call to call: itself, its effects, and what delays; without buffers."""
+    def parts(self) -> dict[str, Part]:
+        """All that keeps something from call to call, by name: itself, its delays, its effects and their state."""
+        parts: dict[str, Part] = {"drive": self, "delays": self._delays}
+        parts |= {f"delays.{name}": buffer for name, buffer in self._delays.buffers.items()}
+        if self.effects is not None:
+            parts |= {"effects": self.effects, "effects.state": self.effects.state}
+            for i, effect in enumerate(self.effects.effects):
+                parts[own := f"effects.{i}.{effect.name}"] = effect
+                parts |= {f"{own}.{name}": buffer for name, buffer in effect.buffers.items()}
+        return parts
+
+    def branches(self) -> dict[str, dict[str, Hashable]]:
+        """All that Python branches over in a call, by part: with the same, calls do the same operations."""
+        return {name: part.flags() for name, part in self.parts().items()}
+
+    @torch.inference_mode(False)  # may be restored outside of the caller's inference mode too
+    def snapshot(self) -> dict[str, Any]:
+        """All that it keeps from call to call, by name: copies, nearly all of them tensors."""
+        return {
+            f"{name}.{key}": _copied(getattr(part, key)) for name, part in self.parts().items() for key in part.kept()
+        }
+
+    @torch.inference_mode(False)
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Go on from a :meth:`snapshot` of it, or of a drive like it; its numbers stay."""
+        parts = self.parts()
+        for name, value in snapshot.items():
+            part, _, key = name.rpartition(".")
+            setattr(parts[part], key, _copied(value))
+
+    # ---- what the simulator is to apply, what encoders show, and what effects read -------------------------------
+
+    @property
+    def _feeds_back(self) -> bool:
+        """Whether an effect lets the torque of a loop that is held follow the motion in between."""
+        held = not self.cfg.implicit and self.cfg.delay_mode == "command"
+        return held and self.effects is not None and self.effects.has("feedback")
+
+    @property
+    def held_effort(self) -> torch.Tensor:
+        """The torque that the simulator is to hold until the next call [N m], (num_envs, num_joints).
+
+        ``applied_effort``, unless ``holds_line``: then the torque that the line has at standstill.
+        """
+        return self._held_effort
+
+    @property
+    def joint_armature(self) -> torch.Tensor:
+        """Rotor inertia that the simulator is to carry [kg m²], (num_envs, num_joints)."""
+        return self.armature if self.effects is None else self.effects.state.armature
+
+    @property
+    def joint_friction(self) -> torch.Tensor:
+        """Coulomb friction that the simulator is to apply until the next call [N m], (num_envs, num_joints)."""
         stack = self.effects
-        return [self, self._delays, *([] if stack is None else [stack, *stack.effects])]
+        return stack.state.friction if stack is not None and stack.changes_passive else self.friction
 
-    def delays(self) -> list[DelayBuffer]:
-        """The buffers of the drive's delay and of its effects'."""
-        held = [value for each in self.parts() for value in vars(each).values() if isinstance(value, DelayBuffer)]
-        return [*self._delays.buffers, *held]
+    @property
+    def joint_viscous_friction(self) -> torch.Tensor:
+        """Viscous friction that the simulator is to apply until the next call [N m s/rad], (num_envs, num_joints)."""
+        stack = self.effects
+        if stack is not None and stack.changes_passive:
+            return stack.state.viscous_friction
+        return self.viscous_friction if self._speed_slope is None else self.viscous_friction + self._speed_slope
 
-    def flags(self) -> list[tuple]:
-        """Everything of the drive and its effects that is no tensor and can be compared: what Python branches over."""
-        return [
-            tuple(
-                (key, frozenset(value) if isinstance(value, set) else value)
-                for key, value in vars(each).items()
-                if value is None or isinstance(value, (bool, int, float, str, set))
-            )
-            for each in self.parts()
-        ]
+    @property
+    def joint_implicit_damping(self) -> torch.Tensor | None:
+        """More viscous friction, which must act on the speed at the end of the step [N m s/rad]; ``None`` if none."""
+        stack = self.effects
+        return stack.state.implicit_damping if stack is not None and stack.changes_passive else None
+
+    @property
+    def changes_passive(self) -> bool:
+        """Whether ``joint_friction`` and ``joint_viscous_friction`` change from call to call."""
+        own = self.holds_line or self.cfg.implicit or self._feeds_back
+        return own or (self.effects is not None and self.effects.changes_passive)
+
+    @property
+    def needs_load(self) -> bool:
+        """Whether an effect reads the torque of gravity and load (:meth:`set_load_effort`)."""
+        return self.effects is not None and self.effects.needs_load
+
+    @property
+    def needs_link(self) -> bool:
+        """Whether effects need what :meth:`set_link` gives."""
+        return self.effects is not None and self.effects.needs_link
+
+    @property
+    def changes_armature(self) -> bool:
+        """Whether ``joint_armature`` changes from call to call."""
+        return self.effects is not None and self.effects.changes_armature
+
+    @property
+    def distorts_measurement(self) -> bool:
+        """Whether an effect lets encoders show something else than the joints' positions."""
+        return self.effects is not None and self.effects.has("measurement")
+
+    def sensed_position(self, joint_pos: torch.Tensor) -> torch.Tensor:
+        """What the encoder shows, before its bias is subtracted [rad], (num_envs, num_joints).
+
+        Args:
+            joint_pos: q [rad], (num_envs, num_joints).
+        """
+        return joint_pos if self.effects is None else self.effects.sensed_position(joint_pos)
+
+    def position_that_shows(self, encoder_pos: torch.Tensor) -> torch.Tensor:
+        """The joint position at which the encoder shows a value before its bias: inverse of :meth:`sensed_position`.
+
+        Args:
+            encoder_pos: [rad], (num_envs, num_joints).
+        """
+        position = encoder_pos.clone()
+        if self.distorts_measurement:
+            for _ in range(_INVERSION_STEPS):
+                position += encoder_pos - self.sensed_position(position)
+        return position
+
+    def observe(self, joint_pos: torch.Tensor, joint_vel: torch.Tensor) -> torch.Tensor:
+        """What the encoder shows now, before its bias; may be called before :meth:`compute` of the same instant.
+
+        Args:
+            joint_pos: q [rad], (num_envs, num_joints).
+            joint_vel: v [rad/s], (num_envs, num_joints).
+        """
+        if self.effects is None:
+            return joint_pos
+        self.effects.begin_step(joint_pos, joint_vel)
+        return self.sensed_position(joint_pos)
+
+    def held(
+        self,
+        joint_pos: torch.Tensor,
+        joint_vel: torch.Tensor,
+        position: torch.Tensor,
+        speed: torch.Tensor,
+        free: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Where joints are whose encoders are held; what moves with them is put there. Before :meth:`compute`.
+
+        Args:
+            joint_pos: q [rad], (num_envs, num_joints).
+            joint_vel: v [rad/s], (num_envs, num_joints).
+            position: What encoders show before their bias [rad], (num_envs, num_joints).
+            speed: The speed that they show [rad/s], (num_envs, num_joints).
+            free: Joints that are not held, (num_envs, num_joints) bool: any value may stand there.
+
+        Returns:
+            Position and speed of the joints; where they are free, any.
+        """
+        if self.effects is None or not self.effects.has("hold"):
+            return position, speed
+        return self.effects.held(joint_pos, joint_vel, position, speed, free)
+
+    def set_load_effort(self, load_effort: torch.Tensor) -> None:
+        """Give the torque of gravity and load on the joints at this instant [N m], (num_envs, num_joints)."""
+        if self.effects is not None:
+            self.effects.state.load_effort = load_effort
+
+    def set_link(self, inertia: torch.Tensor, stiffness: torch.Tensor, spare: torch.Tensor) -> None:
+        """Give what the joints carry at this instant, (num_envs, num_joints) each.
+
+        Args:
+            inertia: Without armature [kg m²].
+            stiffness: How fast gravity pulls back with the angle [N m/rad].
+            spare: What may be taken from the inertia beyond the armature [kg m²].
+        """
+        if self.effects is not None:
+            s = self.effects.state
+            s.link_inertia, s.load_stiffness, s.spare_inertia = inertia, stiffness, spare
+
+    def set_session_time(self, time: torch.Tensor) -> None:
+        """Set the time since the session began [s], (num_envs, 1) or (num_envs, num_joints); it goes on from there."""
+        if self.effects is not None:
+            self.effects.state.time = time.expand_as(self.effects.state.time)
+
+    def remember(self, heat: Heat) -> None:
+        """Give effects the drive's work in the session before, once the parameters are known."""
+        for effect in () if self.effects is None else self.effects.effects:
+            effect.remember(heat)
+
+    def notice(self, conditions: Conditions) -> None:
+        """Give effects the logged conditions of the drive."""
+        for effect in () if self.effects is None else self.effects.effects:
+            effect.notice(conditions)
+
+    # ---- inside --------------------------------------------------------------------------------------------------
+
+    def _mask(self, env_ids: Sequence[int] | torch.Tensor | slice) -> torch.Tensor:
+        """Environments, by index or already a mask, as (num_envs,) bool."""
+        if isinstance(env_ids, torch.Tensor) and env_ids.dtype == torch.bool:
+            return env_ids
+        chosen = torch.zeros(self._num_envs, dtype=torch.bool, device=self._device)
+        chosen[env_ids] = True
+        return chosen
 
     def _check_shapes(self, **given: torch.Tensor | None) -> None:
         """Refuse what has not a row per environment and a column per joint: torch would spread it without a word."""
@@ -450,6 +507,10 @@ class Drive:
             device=self._device,
             dtype=self._dtype,
         )
+
+
+def _copied(value: Any) -> Any:
+    return value.clone() if isinstance(value, torch.Tensor) else copy.copy(value)
 
 
 def _applies(cfg: EffectCfg, joint_names: Sequence[str]) -> bool:

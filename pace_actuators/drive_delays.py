@@ -8,17 +8,20 @@ from typing import TypeVar
 import torch
 
 from pace_actuators.delay_buffer import DelayBuffer, Interpolation, Jump
+from pace_actuators.part import Part
 
 EnvIds = Sequence[int] | torch.Tensor | slice | None
 _Signal = TypeVar("_Signal", torch.Tensor, torch.Tensor | None)
 
 
-class DriveDelays:
+class DriveDelays(Part):
     """One lag for several signals, in control steps; the signals come at every run of the controller.
 
     A signal that is not given (``None``) passes; when it comes back, what was before counts as zero, and for positions
     as the first one.
     """
+
+    memory = ("_silent",)
 
     def __init__(
         self,
@@ -43,18 +46,14 @@ class DriveDelays:
             parts: Calls of the drive from one run to the next.
         """
         self._runs = runs
-        self._buffers = {name: DelayBuffer(max_delay * runs, num_envs, device, interpolation, parts) for name in names}
-        self._silent: set[str] = set()  # signals that were not given at the last run
-
-    @property
-    def buffers(self) -> list[DelayBuffer]:
-        """The delay of each signal."""
-        return list(self._buffers.values())
+        self.buffers = {name: DelayBuffer(max_delay * runs, num_envs, device, interpolation, parts) for name in names}
+        """The delay of each signal, by name."""
+        self._silent: frozenset[str] = frozenset()  # signals that were not given at the last run
 
     @property
     def time_lags(self) -> torch.Tensor:
         """Delay [control steps] of each environment, (num_envs,), or joint, (num_envs, num_joints)."""
-        return next(iter(self._buffers.values())).time_lags / self._runs
+        return next(iter(self.buffers.values())).time_lags / self._runs
 
     def set_time_lag(self, delay: torch.Tensor | float, env_ids: EnvIds = None) -> None:
         """Set the delay of all or some environments [control steps].
@@ -63,31 +62,31 @@ class DriveDelays:
             ValueError: If one lies outside 0 to the largest.
         """
         lag = torch.as_tensor(delay, dtype=torch.float64) * self._runs
-        for buffer in self._buffers.values():
+        for buffer in self.buffers.values():
             buffer.set_time_lag(lag, env_ids)
 
     def set_lead(self, lead: float) -> None:
         """Say by how much the simulator lets what it is given act too early [runs of the controller]."""
-        for buffer in self._buffers.values():
+        for buffer in self.buffers.values():
             buffer.set_lead(lead)
 
     def reset(self, env_ids: EnvIds = None) -> None:
         """Forget the history of all or some environments."""
-        for buffer in self._buffers.values():
+        for buffer in self.buffers.values():
             buffer.reset(env_ids)
         if env_ids is None:
-            self._silent.clear()
+            self._silent = frozenset()
 
     def push(self, name: str, data: _Signal) -> _Signal:
         """Take a signal at a run of the controller, and give what has arrived of it until the next call."""
-        buffer = self._buffers.get(name)
+        buffer = self.buffers.get(name)
         if buffer is None:
             return data
         if data is None:
-            self._silent.add(name)
+            self._silent |= {name}
             return None
         if name in self._silent:  # until now there was no target, or it was zero
-            self._silent.remove(name)
+            self._silent -= {name}
             buffer.reset()
             if name != "positions":
                 buffer.compute(torch.zeros_like(data))
@@ -95,19 +94,19 @@ class DriveDelays:
 
     def changes(self, part: int) -> bool:
         """Whether another sample arrives at a call between two runs."""
-        return any(buffer.changes(part) for name, buffer in self._buffers.items() if name not in self._silent)
+        return any(buffer.changes(part) for name, buffer in self.buffers.items() if name not in self._silent)
 
     def at(self, name: str, part: int, undelayed: _Signal) -> _Signal:
         """What has arrived of a signal at a call between two runs; ``undelayed`` if it is not delayed or not given."""
-        buffer = self._buffers.get(name)
+        buffer = self.buffers.get(name)
         return undelayed if buffer is None or name in self._silent else buffer.part(part)
 
     def mean(self, name: str, undelayed: torch.Tensor) -> torch.Tensor:
         """The mean of what arrives of a signal until the next run; ``undelayed`` if it is not delayed."""
-        buffer = self._buffers.get(name)
+        buffer = self.buffers.get(name)
         return undelayed if buffer is None or name in self._silent else buffer.mean()
 
     def jump(self, name: str, part: int) -> Jump | None:
         """How a signal changes within a call; ``None`` if it does not, or is not delayed or not given."""
-        buffer = self._buffers.get(name)
+        buffer = self.buffers.get(name)
         return None if buffer is None or name in self._silent else buffer.jump(part)

@@ -17,8 +17,6 @@ What differs there, and is converted here:
 
 from __future__ import annotations
 
-import copy
-import copyreg
 import dataclasses
 import warnings
 from collections.abc import Sequence
@@ -32,7 +30,6 @@ from mjlab.managers.event_manager import EventTermCfg, requires_model_fields
 from mjlab.utils.spec import create_motor_actuator, get_non_free_joints
 
 from pace_actuators.actions import ActuatorActions
-from pace_actuators.effects import DriveState
 from pace_actuators.identified import IdentifiedDrives
 from pace_actuators.pace_dc_motor import PaceDCMotor
 from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
@@ -40,8 +37,6 @@ from pace_actuators.representable import MJLAB, check_representable, refuse_iner
 
 _SMALLEST_FRICTION = 1e-9
 """Where friction changes from step to step, the model must have some from the start [N m]."""
-
-copyreg.pickle(DriveState, lambda state: (DriveState, (state._fields,)))  # type: ignore[arg-type]  # to copy a drive
 
 
 @dataclass(kw_only=True)
@@ -117,7 +112,7 @@ class PaceDCMotorActuator(Actuator):  # type: ignore[misc]
             "friction": torch.tensor([float(joint.frictionloss) for joint in self._joints]),
             "viscous_friction": torch.tensor([_first(joint.damping) for joint in self._joints]),
         }
-        self._before: PaceDCMotor | None = None
+        self._before: dict[str, Any] | None = None
         self._was_reset = True
         self._bias_written = False
 
@@ -168,7 +163,7 @@ class PaceDCMotorActuator(Actuator):  # type: ignore[misc]
         self._take_back()
         self._write_bias()
         if self._was_reset:
-            self._before, self._was_reset = copy.deepcopy(self.motor), False
+            self._before, self._was_reset = self.motor.snapshot(), False
         motor = self.motor
         if motor.needs_load:
             motor.set_load_effort(-self._data.qfrc_bias[:, self._dofs])
@@ -198,7 +193,8 @@ class PaceDCMotorActuator(Actuator):  # type: ignore[misc]
     def _take_back(self) -> None:
         """Undo the last call of :meth:`compute` if no physics step followed it."""
         if self._before is not None:
-            self.motor, self._before, self._was_reset = self._before, None, True
+            self.motor.restore(self._before)
+            self._before, self._was_reset = None, True
 
     def _write_bias(self) -> None:
         """Once, on top of what mjlab's own randomisation at startup has drawn."""

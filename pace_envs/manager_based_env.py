@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from pace_actuators.config import Config
+from pace_actuators.effects import DriveState
 from pace_envs.compiler.fusion import Fusion, fusion_for
 from pace_envs.managers import (
     ActionManager,
@@ -242,7 +243,7 @@ class ManagerBasedEnv(gym.Env):
         """The objects that keep something from physics step to physics step beside the simulation."""
         robots = self.scene.articulations.values()
         drives = [drive for robot in robots for drive in robot.actuators.values()]
-        parts = [part for drive in drives for part in (*drive.parts(), *drive.delays())]
+        parts = [part for drive in drives for part in drive.parts().values() if not isinstance(part, DriveState)]
         return [*parts, *(robot.data for robot in robots), self.action_manager, *self.action_manager.terms]
 
     def _graph_key(self) -> Hashable:

@@ -17,7 +17,7 @@ from pace_envs.compiler.nvrtc import kernels_of
 _RUNS_BEFORE = 3
 """Runs before a capture: constants are copied to the GPU, every tensor has found its place, kernels are compiled."""
 Place = tuple[int, str]
-_PLAIN = (type(None), bool, int, float, str, set)
+_PLAIN = (type(None), bool, int, float, str, set, frozenset)
 
 _ALIGNED, _WIDTH, _MOST_BLOCKS = 16, 256, 1024
 """Bytes that a thread copies at once, threads of a block, and blocks at most."""
@@ -190,7 +190,7 @@ def _comparable(value: Any) -> Hashable:
 
 
 def _set(holder: dict[str, Any], name: str, value: Any) -> None:
-    if isinstance(value, frozenset):
+    if isinstance(holder[name], set):
         holder[name].clear()
         holder[name].update(value)
     else:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
@@ -23,7 +22,7 @@ class CommandRateLimit(Effect):
 
     name = "command_rate_limit"
     stage = "command"
-    memory: ClassVar[Mapping[str, float]] = {"_target": 0.0}
+    memory = ("_target",)
     _target: torch.Tensor
     parameters = (
         EffectParameter(
@@ -51,9 +50,7 @@ class CommandRateLimit(Effect):
 
     def command(self, s: DriveState) -> None:
         """Follow the target at the limit; the first counts as reached."""
-        new = self.take_new_rows()
-        if new is not None:
-            self._target = torch.where(new, s.joint_pos_target, self._target)
+        self.begin(_target=s.joint_pos_target)
         error = s.joint_pos_target - self._target
         limited = self._target + error.clamp(-self._step, self._step)
         self._target = torch.where(error.abs() <= self._step, s.joint_pos_target, limited)
@@ -71,7 +68,7 @@ class CommandAccelerationLimit(Effect):
 
     name = "command_acceleration_limit"
     stage = "command"
-    memory: ClassVar[Mapping[str, float]] = {"_target": 0.0, "_speed": 0.0}
+    memory = ("_target", "_speed")
     _target: torch.Tensor
     _speed: torch.Tensor
     parameters = (
@@ -105,10 +102,7 @@ class CommandAccelerationLimit(Effect):
 
     def command(self, s: DriveState) -> None:
         """Follow the target on the profile; the first counts as reached."""
-        new = self.take_new_rows()
-        if new is not None:
-            self._target = torch.where(new, s.joint_pos_target, self._target)
-            self._speed = torch.where(new, 0.0, self._speed)
+        self.begin(_target=s.joint_pos_target, _speed=0.0)
         h, gain = self._h, self._gain
         for _ in range(self._steps):
             error = s.joint_pos_target - self._target
@@ -126,7 +120,7 @@ class CommandFilter(Effect):
 
     name = "command_filter"
     stage = "command"
-    memory: ClassVar[Mapping[str, float]] = {"_target": 0.0}
+    memory = ("_target",)
     _target: torch.Tensor
     parameters = (EffectParameter(name="time_constant", unit="s", lower=0.0, upper=0.2, null=0.0, start=0.01),)
     equation = "T dx/dt + x = q*, the controller follows x"
@@ -143,9 +137,7 @@ class CommandFilter(Effect):
 
     def command(self, s: DriveState) -> None:
         """Follow the command; the first counts as reached."""
-        new = self.take_new_rows()
-        if new is not None:
-            self._target = torch.where(new, s.joint_pos_target, self._target)
+        self.begin(_target=s.joint_pos_target)
         self._target = torch.lerp(self._target, s.joint_pos_target, self._weight)
         s.joint_pos_target = self._target
 
@@ -184,25 +176,20 @@ class OtherDelay(Effect):
     def prepare(self) -> None:
         """Lags in the steps of the path: torques pass at every physics step, targets at every run of the controller."""
         dt = self.dt if self.delay_mode == "command" else self.control_dt
-        if not hasattr(self, "_buffer"):
-            upper = self.parameters[0].upper / dt
-            self._buffer = DelayBuffer(upper, self.shape[0], self._options["device"])
-        lags = self.delay / dt
-        self._buffer.set_time_lag(lags.clamp(0.0, self._buffer.max_delay).double())
-
-    def reset_state(self, rows: torch.Tensor | slice) -> None:
-        """Forget the history."""
-        self._buffer.reset(rows)
+        upper = self.parameters[0].upper / dt
+        if not self.buffers:
+            self.buffers["path"] = DelayBuffer(upper, self.shape[0], self._options["device"])
+        self.buffers["path"].set_time_lag((self.delay / dt).clamp(0.0, upper).double())
 
     def command(self, s: DriveState) -> None:
         """Delay the target where the base delays the torque."""
         if self.delay_mode == "effort":
-            s.joint_pos_target = self._buffer.compute(s.joint_pos_target)
+            s.joint_pos_target = self.buffers["path"].compute(s.joint_pos_target)
 
     def effort_command(self, s: DriveState) -> None:
         """Delay the torque where the base delays the command."""
         if self.delay_mode == "command":
-            s.effort = self._buffer.compute(s.effort)
+            s.effort = self.buffers["path"].compute(s.effort)
             s.speed_slope *= (1 - self.delay / self.dt).clamp(min=0.0)
 
 
@@ -281,7 +268,7 @@ class FastLoop(Effect):
 
     name = "fast_loop"
     stage = "controller"
-    memory: ClassVar[Mapping[str, float]] = {"_seen": 0.0, "_speed": 0.0}
+    memory = ("_seen", "_speed")
     _seen: torch.Tensor
     _speed: torch.Tensor
     parameters = (
@@ -322,7 +309,7 @@ class IntegralGain(Effect):
 
     name = "integral_gain"
     stage = "controller"
-    memory: ClassVar[Mapping[str, float]] = {"_integral": 0.0}
+    memory = ("_integral",)
     _integral: torch.Tensor
     parameters = (
         EffectParameter(name="gain", unit="N m/(rad s)", lower=0.0, upper=1000.0, null=0.0, start=10.0, meaning="ki"),
@@ -352,9 +339,7 @@ class IntegralGain(Effect):
 
     def controller_effort(self, s: DriveState) -> None:
         """Add the integral's torque; it begins empty."""
-        new = self.take_new_rows()
-        if new is not None:
-            self._integral = torch.where(new, 0.0, self._integral)
+        self.begin(_integral=0.0)
         summed = self._integral + self._per_step * s.position_error
         self._integral = torch.clamp(summed, -self.effort, self.effort)
         s.effort += self._integral

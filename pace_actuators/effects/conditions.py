@@ -6,9 +6,6 @@ for milliseconds is no condition: see ``supply_sag``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 import torch
 
 from pace_actuators.effects.drive_state import DriveState
@@ -28,9 +25,7 @@ _LEAST = 0.05
 class _OfCondition(Effect):
     """What follows a condition of the drive; where nothing was logged, that is :meth:`usual`."""
 
-    memory: ClassVar[Mapping[str, float]] = dict.fromkeys(
-        ("_first", "_rate", *(f"_place_{k}" for k in range(_PLACES))), 0.0
-    )
+    memory = ("_first", "_rate", *(f"_place_{k}" for k in range(_PLACES)))
     _first: torch.Tensor
     _rate: torch.Tensor
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
@@ -45,7 +44,7 @@ class TorqueFade(Effect):
 
     name = "torque_fade"
     stage = "drive"
-    memory: ClassVar[Mapping[str, float]] = {"_heat": 0.0, "_first": 0.0}
+    memory = ("_heat", "_first")
     _heat: torch.Tensor
     _first: torch.Tensor
     parameters = (
@@ -83,9 +82,7 @@ class TorqueFade(Effect):
 
     def drive(self, s: DriveState) -> None:
         """Scale the torque, and heat up by it."""
-        new = self.take_new_rows()
-        if new is not None:
-            self._heat = torch.where(new, self._first, self._heat)
+        self.begin(_heat=self._first)
         asked = s.effort.clone()
         left = (1.0 - self._heat * self._per_heat).clamp(min=self.least)
         s.effort *= left
@@ -135,7 +132,7 @@ class DriveBandwidth(Effect):
 
     name = "drive_bandwidth"
     stage = "drive"
-    memory: ClassVar[Mapping[str, float]] = {"_torque": 0.0}
+    memory = ("_torque",)
     _torque: torch.Tensor
     parameters = (EffectParameter(name="time_constant", unit="s", lower=0.0, upper=0.03, null=0.0, start=0.002),)
     equation = "T dτ/dt + τ = clip(τ_cmd, ± τ_c)"
@@ -154,9 +151,7 @@ class DriveBandwidth(Effect):
 
     def current_loop(self, s: DriveState) -> None:
         """Give the mean torque over the coming step; the first counts as settled."""
-        new = self.take_new_rows()
-        if new is not None:
-            self._torque = torch.where(new, s.effort, self._torque)
+        self.begin(_torque=s.effort)
         before, asked = self._torque, s.effort.clone()
         self._torque = torch.lerp(before, asked, self._weight)
         s.effort = torch.lerp(before, asked, self._mean_weight)
@@ -256,7 +251,7 @@ class TorqueSpeedLimit(Effect):
 
     name = "torque_speed_limit"
     stage = "drive"
-    memory: ClassVar[Mapping[str, float]] = {"_speed": 0.0}
+    memory = ("_speed",)
     _speed: torch.Tensor
     parameters = (
         EffectParameter(

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import copy
 import operator
 
 import torch
 
+from pace_actuators.part import Part
+
 _LINK_FIELDS = ("load_stiffness", "link_inertia", "spare_inertia")
 
 
-class DriveState:
+class DriveState(Part):
     """The quantities of a drive at one instant, each (rows, num_joints); a field is changed in place or assigned.
 
     What effects change:
@@ -76,7 +77,8 @@ class DriveState:
     held_pos: torch.Tensor
     held_vel: torch.Tensor
 
-    __slots__ = tuple(f"_{name}" for name in __annotations__)
+    memory = tuple(__annotations__)
+    __slots__ = tuple(f"_{name}" for name in memory)
 
     def __init__(self, fields: dict[str, torch.Tensor]):
         """Keep the tensors of the fields."""
@@ -104,10 +106,9 @@ class DriveState:
             raise AttributeError(f"{name} is not computed for this effect: declare {flag} = True in its class.")
         raise AttributeError(f"The drive's state has no {name!r}. Available: {', '.join(_FIELDS)}.")
 
-    def __deepcopy__(self, memo: dict) -> DriveState:
-        """A copy with separate tensors; tensors that share memory still share it in the copy."""
-        fields = {name: getattr(self, name) for name in _FIELDS if hasattr(self, name)}
-        return DriveState(copy.deepcopy(fields, memo))
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """All fields, but those of load and link where they are not wanted."""
+        return {name: getattr(self, name) for name in _FIELDS if hasattr(self, name)}
 
 
 def _field(name: str) -> property:
@@ -122,6 +123,6 @@ def _field(name: str) -> property:
     return property(read, write)
 
 
-_FIELDS = tuple(DriveState.__annotations__)
+_FIELDS = DriveState.memory
 for _name in _FIELDS:
     setattr(DriveState, _name, _field(_name))

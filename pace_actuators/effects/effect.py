@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import torch
 
+from pace_actuators.delay_buffer import DelayBuffer
 from pace_actuators.joint_units import JOINT_TYPES, JointType
+from pace_actuators.part import Part
 
 if TYPE_CHECKING:
     from pace_actuators.effects.drive_state import DriveState
@@ -115,7 +117,7 @@ class EffectParameter:
         return max(low, least), min(high, most)
 
 
-class Effect:
+class Effect(Part):
     """A physical effect on a group of joints, batched over environments.
 
     A subclass declares its parameters and overrides the methods of the stages where it acts; each changes the
@@ -138,6 +140,7 @@ class Effect:
         control_dt: Time between two runs of the controller [s], the control step unless the drive has its own.
         is_trapezoidal: Whether the simulator moves positions with the mean of the old and the new speed.
         new_rows: Which rows have no history yet, (rows, 1) bool; on the CPU ``None`` if all have.
+        buffers: Its delays, by name; a reset of rows resets them too.
     """
 
     name: ClassVar[str]
@@ -154,9 +157,9 @@ class Effect:
     """What a person would see in the data."""
     source: ClassVar[str] = ""
     """Where the equation comes from."""
-    memory: ClassVar[Mapping[str, float]] = {}
-    """What it keeps from step to step: attributes (rows, num_joints) by name, with the value that they begin with. A
-    step assigns new tensors to them."""
+    memory: ClassVar[Collection[str]] = ()
+    """What it keeps from step to step: names of attributes (rows, num_joints), which begin with zero, or in a dict with
+    the value that they begin with. A step assigns new tensors to them."""
     probes: ClassVar[tuple[Mapping[str, float], ...]] = ()
     """Small values at which a screening looks at it; parameters left out are at their start."""
     structural: ClassVar[str] = ""
@@ -230,11 +233,12 @@ class Effect:
         self._options: dict[str, Any] = {"device": torch.device(device), "dtype": dtype}
         self._on_device = torch.device(device).type == "cuda"
         self.new_rows: torch.Tensor | None = ~self._no_rows()
+        self.buffers: dict[str, DelayBuffer] = {}
         for parameter in self.parameters:
             value = parameter.start if parameter.null is None else parameter.null
             setattr(self, parameter.name, self.full(value))
-        for name, value in self.memory.items():
-            setattr(self, name, self.full(value))
+        for name in self.memory:
+            setattr(self, name, self.full(self.memory[name] if isinstance(self.memory, Mapping) else 0.0))
         self.prepare()
 
     # ---- what a subclass overrides -------------------------------------------------------------------------------
@@ -247,6 +251,8 @@ class Effect:
         if self.new_rows is None:
             self.new_rows = self._no_rows()
         self.new_rows[rows] = True
+        for buffer in self.buffers.values():
+            buffer.reset(rows)
 
     def remember(self, heat: Heat) -> None:
         """When a recording begins: take over what the drive did in its session before."""
@@ -318,11 +324,7 @@ class Effect:
     def take_new_rows(self) -> torch.Tensor | None:
         """Which rows have no history yet, (rows, 1) bool, or ``None``: all at first, and those of a reset.
 
-        It says so once; the effect lets their history begin, most often with the first value that it sees::
-
-            new = self.take_new_rows()
-            if new is not None:
-                self._target = torch.where(new, s.joint_pos_target, self._target)
+        It says so once; the effect lets their history begin, most often by :meth:`begin`.
         """
         if self.new_rows is None or not self._on_device:
             new, self.new_rows = self.new_rows, None
@@ -330,6 +332,13 @@ class Effect:
         new = self.new_rows.clone()  # a CUDA graph repeats it, with new rows or without
         self.new_rows.fill_(False)
         return new
+
+    def begin(self, **values: torch.Tensor | float) -> None:
+        """Let the history of rows that have none begin with these values, by the names of its memory."""
+        new = self.take_new_rows()
+        if new is not None:
+            for name, value in values.items():
+                setattr(self, name, torch.where(new, value, getattr(self, name)))
 
     def full(self, value: float) -> torch.Tensor:
         """A tensor of its shape (rows, num_joints)."""
@@ -343,6 +352,10 @@ class Effect:
         return torch.zeros(self.shape[0], 1, dtype=torch.bool, device=self._options["device"])
 
     # ---- what the drive calls ------------------------------------------------------------------------------------
+
+    def kept(self) -> Collection[str]:
+        """What it keeps from call to call."""
+        return (*self.memory, "new_rows")
 
     def set_parameter(
         self, name: str, values: torch.Tensor | float, rows: Any = slice(None), joints: Any = None
@@ -420,6 +433,3 @@ def probe_points(effect: type[Effect]) -> list[dict[str, float]]:
 def off(value: torch.Tensor) -> torch.Tensor:
     """Where a parameter whose null is infinite is at it."""
     return torch.isinf(value)
-
-
-Effects = Sequence[Effect]

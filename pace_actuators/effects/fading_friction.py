@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
@@ -18,15 +17,13 @@ class _FadingFriction(Effect):
     stage = "friction"
     two_sided = False
     smooths_friction = True
-    memory: ClassVar[Mapping[str, float]] = {"_before": 0.0}
+    memory = ("_before",)
     _before: torch.Tensor
     separates = "a staircase that holds each of its steps longer, and a slow triangle"
 
     def middle_speed(self, s: DriveState) -> torch.Tensor:
         """The speed in the middle of the step, as the last two let expect [rad/s]; once per step."""
-        new = self.take_new_rows()
-        if new is not None:
-            self._before = torch.where(new, s.motor_vel, self._before)
+        self.begin(_before=s.motor_vel)
         middle = 1.5 * s.motor_vel - 0.5 * self._before
         self._before = s.motor_vel.clone()
         return middle

@@ -6,8 +6,6 @@ The simulator applies Coulomb friction itself, so that a stuck joint sticks; an 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import ClassVar
 
 import torch
 
@@ -192,7 +190,7 @@ class PreslidingFriction(Effect):
 
     name = "presliding_friction"
     stage = "friction"
-    memory: ClassVar[Mapping[str, float]] = {"_bristle": 0.0, "_position": 0.0}
+    memory = ("_bristle", "_position")
     _bristle: torch.Tensor
     _position: torch.Tensor
     parameters = (
@@ -229,10 +227,7 @@ class PreslidingFriction(Effect):
         of a step, as Newmark's average acceleration does), so that no stiffness is too large for the step. At first no
         bristle is bent.
         """
-        new = self.take_new_rows()
-        if new is not None:
-            self._bristle = torch.where(new, 0.0, self._bristle)
-            self._position = torch.where(new, s.motor_pos, self._position)
+        self.begin(_bristle=0.0, _position=s.motor_pos)
         level = s.friction.clamp(min=1e-9)
         moved = s.motor_pos - self._position
         direction = torch.sign(moved)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 import torch
 
 from pace_actuators.effects.drive_state import DriveState
@@ -70,7 +67,7 @@ class VelocityFilter(Effect):
 
     name = "velocity_filter"
     stage = "measurement"
-    memory: ClassVar[Mapping[str, float]] = {"_seen": 0.0}
+    memory = ("_seen",)
     _seen: torch.Tensor
     parameters = (EffectParameter(name="time_constant", unit="s", lower=0.0, upper=0.03, null=0.0, start=0.003),)
     equation = "T dv_ctrl/dt + v_ctrl = v"
@@ -87,9 +84,7 @@ class VelocityFilter(Effect):
 
     def sensed_velocity(self, s: DriveState) -> None:
         """Filter the speed; the first counts as settled."""
-        new = self.take_new_rows()
-        if new is not None:
-            self._seen = torch.where(new, s.encoder_vel, self._seen)
+        self.begin(_seen=s.encoder_vel)
         self._seen = torch.lerp(self._seen, s.encoder_vel, self._weight)
         s.encoder_vel = self._seen
         s.speed_slope *= self._weight

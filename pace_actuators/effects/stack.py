@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import torch
 
@@ -13,6 +12,7 @@ from pace_actuators.effects.effect import Effect
 from pace_actuators.effects.effect_cfg import EffectCfg
 from pace_actuators.effects.two_mass import join_couplings
 from pace_actuators.joint_values import resolve_joint_values
+from pace_actuators.part import Part
 
 _IN_DRIVE = ("current_limit", "current_loop", "drive", "torque_speed")
 """The way of a torque through the drive: what is asked, what flows, what comes of it, what the supply leaves."""
@@ -34,8 +34,10 @@ _STAGES = (
 )
 
 
-class EffectStack:
+class EffectStack(Part):
     """Holds a drive's effects and the state that they share."""
+
+    memory = ("_step_begun",)
 
     def __init__(
         self,
@@ -64,15 +66,12 @@ class EffectStack:
         Raises:
             ValueError: If joints or values do not fit.
         """
-        self._is_trapezoidal = False
         self.state = DriveState.zeros(num_envs, len(joint_names), device, dtype)
         self.state.enabled.fill_(1.0)
         self._joint_names = list(joint_names)
         self._num_envs = num_envs
         self.dt = dt
         self.effects: list[Effect] = []
-        self.cfgs: list[EffectCfg] = []
-        self._view: dict[Effect, DriveState] = {}
         for cfg in cfgs:
             rows = slice(None) if cfg.env_rows is None else cfg.env_rows
             effect = cfg.effect_class(
@@ -86,22 +85,22 @@ class EffectStack:
                 dtype=dtype,
             )
             self.effects.append(effect)
-            self.cfgs.append(cfg)
-            self._view[effect] = self.state.of_rows(rows, effect.reads_load, effect.reads_link)
             self._configure(effect, cfg)
+        self._step_begun = False
+        self._arrange()
+
+    def _arrange(self) -> None:
+        """Note what each effect sees of the state, and what they do together."""
+        self.views = {each: self.state.of_rows(each.rows, each.reads_load, each.reads_link) for each in self.effects}
+        """What each effect sees of the state."""
         self._at = {
             stage: [
-                (getattr(effect, stage), self._view[effect])
+                (getattr(effect, stage), self.views[effect])
                 for effect in sorted(self.effects, key=_side if stage == "transmission" else lambda _: 0)
                 if effect.overrides(stage)
             ]
             for stage in _STAGES
         }
-        self._step_begun = False
-        self._arrange()
-
-    def _arrange(self) -> None:
-        """Note what the effects do together."""
         self.acts_in_drive = any(self._at[stage] for stage in _IN_DRIVE)
         """Whether what is asked of the motor becomes another torque between its two limits."""
         self.changes_passive = bool(self._at["friction"] or self._at["transmission"])
@@ -114,17 +113,6 @@ class EffectStack:
         self.needs_link = any(effect.reads_link for effect in self.effects)
         """Whether the inertia of what the joints carry must be given."""
 
-    @property
-    def is_trapezoidal(self) -> bool:
-        """Whether the simulator moves positions with the mean of the old and the new speed."""
-        return self._is_trapezoidal
-
-    @is_trapezoidal.setter
-    def is_trapezoidal(self, value: bool) -> None:
-        self._is_trapezoidal = value
-        for effect in self.effects:
-            effect.is_trapezoidal = value
-
     def has(self, stage: str) -> bool:
         """Whether an effect acts at a stage."""
         return bool(self._at[stage])
@@ -134,24 +122,10 @@ class EffectStack:
         for act, view in self._at[stage]:
             act(view)
 
-    def standing_in(
-        self, twins: Mapping[Effect, Effect], state: DriveState, views: Mapping[Effect, DriveState]
-    ) -> EffectStack:
-        """A stack of copies of some of its effects.
-
-        Args:
-            twins: The copies of effects.
-            state: What they share.
-            views: What each copy sees of that.
-        """
+    def of(self, effects: Sequence[Effect], state: DriveState) -> EffectStack:
+        """A stack like it, of effects that share a state."""
         stack = copy.copy(self)
-        stack.effects = [twins[effect] for effect in self.effects if effect in twins]
-        stack.cfgs = [cfg for effect, cfg in zip(self.effects, self.cfgs, strict=True) if effect in twins]
-        stack.state, stack._view, stack._num_envs = state, dict(views), len(state.time)
-        own = {
-            stage: [twins[act.__self__] for act, _ in acts if act.__self__ in twins] for stage, acts in self._at.items()
-        }
-        stack._at = {stage: [(getattr(each, stage), views[each]) for each in acting] for stage, acting in own.items()}
+        stack.effects, stack.state, stack._num_envs = list(effects), state, len(state.time)
         stack._arrange()
         return stack
 
@@ -168,22 +142,13 @@ class EffectStack:
             f"The drive has no effect {name!r}. It has: {', '.join(e.name for e in self.effects) or 'none'}."
         )
 
-    def reset(self, env_ids: Any = None) -> None:
-        """Forget the history of all or some environments."""
+    def reset(self, chosen: torch.Tensor | None = None) -> None:
+        """Forget the history of all environments, or of some, (num_envs,) bool."""
         self._step_begun = False
-        if env_ids is None:
-            for effect in self.effects:
-                effect.reset_state(slice(None))
-            return
-        if isinstance(env_ids, torch.Tensor) and env_ids.dtype == torch.bool:
-            chosen = env_ids
-        else:
-            chosen = torch.zeros(self._num_envs, dtype=torch.bool, device=self.state.time.device)
-            chosen[env_ids] = True
         for effect in self.effects:
-            own = chosen[effect.rows]
-            if own.is_cuda or bool(own.any()):  # a GPU is not waited for
-                effect.reset_state(own)
+            own = None if chosen is None else chosen[effect.rows]
+            if own is None or own.is_cuda or bool(own.any()):  # a GPU is not waited for
+                effect.reset_state(slice(None) if own is None else own)
 
     def take_over(self, armature: torch.Tensor, friction: torch.Tensor, viscous_friction: torch.Tensor) -> None:
         """Take over changed parameters of the base model, (num_envs, num_joints) each, and of the effects."""
@@ -362,12 +327,7 @@ class EffectStack:
     def _configure(self, effect: Effect, cfg: EffectCfg) -> None:
         names = cfg.joints(self._joint_names)
         joints = torch.tensor([self._joint_names.index(name) for name in names], device=self.state.time.device)
-        known = {parameter.name for parameter in effect.parameters}
         for name, value in cfg.values.items():
-            if name not in known:
-                raise ValueError(
-                    f"The effect {effect.name!r} has no parameter {name!r}. Available: {', '.join(sorted(known))}."
-                )
             values = resolve_joint_values(value, names, field=f"{effect.name}.{name}")
             effect.set_parameter(name, values, joints=joints)
         effect.prepare()

@@ -90,7 +90,7 @@ class DriveCode(Names):
             return f"{self._prefix}k{index}[{names[0]}]"
         if node.operation == "ring":
             back = f"{self._own}h{index} - (int){names[0]}"
-            return f"{self._own}r{index}[{back} < 0 ? {back} + {self.tape.rings[index].length} : {back}]"
+            return f"{self._own}r{index}[{back} < 0 ? {back} + {self.tape.rings[index]} : {back}]"
         return super().expression(node)
 
     def begin(self) -> list[str]:
@@ -98,11 +98,11 @@ class DriveCode(Names):
         once = [node for node in self.nodes if self._part[node.number] == -1 and node.operation != "constant"]
         lines = [self._made(node) for node in once]
         offset, own = 0, self._own
-        for i, ring in enumerate(self.tape.rings):
+        for i, length in enumerate(self.tape.rings):
             kept = f"{own}r{i}[i] = rings[({offset}LL + i) * count + e];"
-            head = f"{own}h{i} = 0;" if own else f"double r{i}[{ring.length}]; int h{i} = 0;"
-            lines.append(f"{head} for (int i = 0; i < {ring.length}; ++i) {kept}")
-            offset += ring.length
+            head = f"{own}h{i} = 0;" if own else f"double r{i}[{length}]; int h{i} = 0;"
+            lines.append(f"{head} for (int i = 0; i < {length}; ++i) {kept}")
+            offset += length
         return lines
 
     def part(self, part: int, special: Special, shown: Sequence[str]) -> list[str]:
@@ -119,7 +119,7 @@ class DriveCode(Names):
                 continue
             if node.operation == "push":
                 head, ring = f"{self._own}h{node.index}", f"{self._own}r{node.index}"
-                turn = f"{head} = {head} + 1 == {self.tape.rings[node.index].length} ? 0 : {head} + 1;"
+                turn = f"{head} = {head} + 1 == {self.tape.rings[node.index]} ? 0 : {head} + 1;"
                 lines.append(f"{turn} {ring}[{head}] = {self.of(node.arguments[0])};")
             elif node.operation == "physics":
                 lines.append(special(node))
@@ -134,11 +134,11 @@ class DriveCode(Names):
     def memory(self) -> list[str]:
         """Declarations of what is kept; none is larger than a double."""
         kept = [f"{node.kind} {super(DriveCode, self).of(node)};" for node in self.kept]
-        return [*kept, *(f"double r{i}[{ring.length}]; int h{i};" for i, ring in enumerate(self.tape.rings))]
+        return [*kept, *(f"double r{i}[{length}]; int h{i};" for i, length in enumerate(self.tape.rings))]
 
     def size(self) -> int:
         """As many doubles have room for it."""
-        return len(self.kept) + sum(ring.length + 1 for ring in self.tape.rings)
+        return len(self.kept) + sum(length + 1 for length in self.tape.rings)
 
     def _made(self, node: Node, expression: str | None = None) -> str:
         if self._own and node in self.kept:

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import copy
-import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial, reduce
 from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 
 from pace_actuators import PaceDCMotor
 from pace_actuators.delay_buffer import DelayBuffer
-from pace_actuators.effects import Effect, EffectStack
+from pace_actuators.effects import Effect
 from pace_actuators.effects.drive_state import DriveState
+from pace_actuators.part import Part
 from pace_envs.compiled_drive.drive_code import Program, Read
 from pace_envs.compiler.operations import TYPES, UNARY, is_compared, rule
-from pace_envs.compiler.tape import Node, NotTraceableError, Ring, Tape
+from pace_envs.compiler.tape import Node, NotTraceableError, Tape
 from pace_envs.compiler.tracer import Tracer, tensors_in
 from pace_envs.mdp import JointPositionAction
 
@@ -110,14 +111,6 @@ class JointTracer(Tracer):
     def put(self, tensor: torch.Tensor, node: Node) -> None:
         """Let a tensor stand for another number, of its type."""
         self._nodes[tensor.data_ptr()] = self.tape.cast(node, TYPES[tensor.dtype])
-
-    def keep(self, ring: int, sample: torch.Tensor) -> None:
-        """Put a sample into a ring."""
-        self.tape.new("push", self.node(sample, "double"), index=ring)
-
-    def seen(self, ring: int, back: torch.Tensor) -> torch.Tensor:
-        """The sample of so many pushes ago, whole numbers in a double."""
-        return self.tensor(self.tape.new("ring", self.node(back), index=ring))
 
     # ------------------------------------------------------------------ what torch asks
 
@@ -233,7 +226,7 @@ def _promoted(args: Sequence[Any], tensors: Sequence[torch.Tensor]) -> torch.dty
         types.add(torch.get_default_dtype())
     if int in numbers and types == {torch.bool}:
         types.add(torch.int64)
-    return functools.reduce(torch.promote_types, types)
+    return reduce(torch.promote_types, types)
 
 
 class TracedDelay(DelayBuffer):
@@ -251,31 +244,27 @@ class TracedDelay(DelayBuffer):
         self._tracer, self._make_lag = tracer, lag
         self.ring: int | None = None
         """Index of its memory, once it is used."""
-        self._all_zero, self._whole = False, self.interpolation == "hold"
+        self._all_zero = False
 
     def compute(self, data: torch.Tensor) -> torch.Tensor:
         """As the delay's."""
         if self.ring is None:
-            self.ring = self._tracer.tape.ring(Ring(self._length, self.interpolation, self.parts))
-            self._note(self._make_lag())
-        self._tracer.keep(self.ring, data)
+            self.ring = self._tracer.tape.ring(self._length)
+            self._lag, self._lead = self._make_lag(), 0.0
+            self._index_lags()
+        self._tracer.tape.new("push", self._tracer.node(data, "double"), index=self.ring)
         return self.part(0) if self._at else self.mean()
 
-    def _note(self, lag: torch.Tensor) -> None:
-        self._newer = lag.ceil() if self._whole else lag.floor()
-        self._older, self._fraction = self._newer + 1.0, lag - self._newer
-        self._at = {}
-        for part in range(self.parts if self.parts > 1 and not self._whole else 0):
-            left = lag - part / self.parts
-            back = left.ceil().clamp(min=0.0)
-            weight = (self.parts * (1 + left - back)).clamp(max=1.0)
-            self._at[part] = (back - 1.0).clamp(min=0.0), back, weight
-        self._switches = set(self._at)
+    def _all(self, which: torch.Tensor) -> bool:
+        return False
+
+    def _rows(self, steps: torch.Tensor) -> torch.Tensor:
+        return steps
 
     def _seen(self, rows: torch.Tensor) -> torch.Tensor:
         if self.ring is None:
             raise NotTraceableError("a delay that is read before it has a sample")
-        return self._tracer.seen(self.ring, rows)
+        return self._tracer.tensor(self._tracer.tape.new("ring", self._tracer.node(rows), index=self.ring))
 
 
 class OneJoint:
@@ -360,7 +349,7 @@ class OneJoint:
         Raises:
             NotTraceableError: If something counts steps in Python.
         """
-        before = self.drive.flags()
+        before = self.drive.branches()
         if hold is not None:
             hold()
         shown = {"out": self.tracer.node(self.robot.sensed_joint_pos())}
@@ -372,7 +361,7 @@ class OneJoint:
                 shown.setdefault("effort", self.tracer.node(self.drive.motor_effort))
             self.robot._sim.step()
             self.robot.update()
-        if self.drive.flags() != before:
+        if self.drive.branches() != before:
             raise NotTraceableError("a drive or an effect that counts steps in Python")
         return shown
 
@@ -416,11 +405,13 @@ class OneJoint:
         value = true[key]
         if value.ndim < 2 or value.dtype not in TYPES:  # the same for all joints
             return
-        place = value.data_ptr(), value.shape, value.dtype
+        place = _place(value)
         if place not in self._known:
             kind = TYPES[value.dtype]
             entries = value.shape[2] if value.ndim == 3 else 1
-            tensor = self.leaf(lambda: self._numbers(true[key], begin, columns), kind, entries)
+            rows = slice(self.rows.start - begin, self.rows.stop - begin)
+            read = partial(_numbers, true, key, rows, columns, (len(self.rows), len(self.columns)))
+            tensor = self.leaf(read, kind, entries)
             self._known[place] = tensor, len(self.leaves) - 1
         holder[key], index = self._known[place]
         if value.ndim == 2:
@@ -448,8 +439,6 @@ class OneJoint:
             columns=self.columns,
         )
         self.tracer.forget()
-        for each in (self._known, self._after, self._delays, self._series, vars(self.robot), vars(self.drive)):
-            each.clear()
         return program
 
     # ------------------------------------------------------------------ inside
@@ -466,65 +455,65 @@ class OneJoint:
                 raise NotTraceableError("tensors that shared their memory and do not any more")
         return {i: node for i, node in updates.items() if node is not leaves[i]}
 
-    def _numbers(self, tensor: torch.Tensor, begin: int, columns: torch.Tensor | None) -> torch.Tensor:
-        own = tensor[self.rows.start - begin : self.rows.stop - begin]
-        own = own if columns is None or own.shape[1] == 1 else own[:, columns]
-        if own.ndim == 3:
-            return own.permute(2, 0, 1)
-        return own.to(torch.float64).expand(len(self.rows), len(self.columns))[None]
-
     def _copied_drive(self) -> PaceDCMotor:
-        actuator, stack = self._actuator, self._actuator.effects
-        begin, end = self.rows.start, self.rows.stop
-        twins: dict[Effect, Effect] = {}
-        effects: EffectStack | None = None
-        if stack is not None:
-            rows = {effect: effect.rows.indices(actuator._num_envs)[:2] for effect in stack.effects}
-            acting = [effect for effect in stack.effects if rows[effect][0] <= begin and end <= rows[effect][1]]
-            states = self._states([stack.state, *(stack._view[effect] for effect in acting)])
-            for effect in acting:
-                twins[effect] = self._copied(effect, rows[effect][0])
-                twins[effect].shape, twins[effect].rows = (1, 1), slice(None)
-            if acting:
-                effects = stack.standing_in(twins, states[0], dict(zip(twins.values(), states[1:], strict=True)))
-        drive = self._copied(actuator)
-        drive.effects = effects
-        drive._num_envs, drive._joint_names, drive._joint_indices = 1, drive._joint_names[:1], slice(None)
-        drive._delays = copy.copy(actuator._delays)
-        drive._delays._silent = set(actuator._delays._silent)
-        drive._delays._buffers = {name: self._delay(each) for name, each in actuator._delays._buffers.items()}
+        actuator, stack, effects = self._actuator, self._actuator.effects, None
+        if stack is not None and (acting := self._acting(stack.effects)):
+            state = self._state(stack.state, [stack.views[effect] for effect in acting])
+            twins = [self._copied(effect, begin) for effect, begin in acting.items()]
+            for twin, (effect, begin) in zip(twins, acting.items(), strict=True):
+                twin.shape, twin.rows, twin.buffers = (1, 1), slice(None), self._traced(effect.buffers, begin)
+            effects = stack.of(twins, state)
+        drive: PaceDCMotor = self._copied(actuator)
+        drive._num_envs, drive._joint_names, drive._joint_indices = 1, actuator.joint_names[:1], slice(None)
+        drive._delays, drive.effects = copy.copy(actuator._delays), effects
+        drive._delays.buffers = self._traced(actuator._delays.buffers)
         return drive
 
-    def _copied(self, thing: Any, begin: int = 0) -> Any:
-        """A copy of an object whose tensors all are of the drive's joints."""
-        twin = copy.copy(thing)
-        for key, value in vars(thing).items():
-            if isinstance(value, torch.Tensor):
-                self.replace(vars(twin), vars(thing), key, begin)
-            elif isinstance(value, DelayBuffer):
-                vars(twin)[key] = self._delay(value, begin)
+    def _acting(self, effects: Sequence[Effect]) -> dict[Effect, int]:
+        """Those that act in its rows, and where their own rows begin."""
+        own = {effect: range(self._actuator._num_envs)[effect.rows] for effect in effects}
+        first, last = self.rows[0], self.rows[-1]
+        return {effect: rows.start for effect, rows in own.items() if first in rows and last in rows}
+
+    def _copied(self, part: Part, begin: int = 0) -> Any:
+        """A copy of a part whose tensors all are of the drive's joints."""
+        twin = copy.copy(part)
+        for key in part.tensors():
+            self.replace(vars(twin), vars(part), key, begin)
         return twin
 
-    def _states(self, states: Sequence[DriveState]) -> list[DriveState]:
-        """A drive's state and views of it, which share memory."""
-        whole: dict[str, torch.Tensor] = {}
-        for name in DriveState.__annotations__:
-            true = {name: getattr(states[0], f"_{name}")}
-            self.replace(whole, true, name)
-            index = len(self.leaves) - 1
-            for view in states[1:]:
-                if hasattr(view, f"_{name}"):
-                    tensor = getattr(view, f"_{name}")
-                    self._known[tensor.data_ptr(), tensor.shape, tensor.dtype] = whole[name], index
-        kept = [[name for name in whole if hasattr(state, f"_{name}")] for state in states]
-        return [DriveState({name: whole[name] for name in names}) for names in kept]
+    def _state(self, state: DriveState, views: Sequence[DriveState]) -> DriveState:
+        """What stands for a drive's state, and for what is seen of it through its views."""
+        twin: dict[str, torch.Tensor] = {}
+        true, seen = state.tensors(), [view.tensors() for view in views]
+        for name, tensor in true.items():
+            self.replace(twin, true, name)
+            self._known |= {_place(each[name]): self._known[_place(tensor)] for each in seen if name in each}
+        return DriveState(twin)
 
-    def _delay(self, buffer: DelayBuffer, begin: int = 0) -> TracedDelay:
+    def _traced(self, buffers: Mapping[str, DelayBuffer], begin: int = 0) -> dict[str, DelayBuffer]:
+        """What stands for delays."""
+        return {name: self._delay(buffer, begin) for name, buffer in buffers.items()}
+
+    def _delay(self, buffer: DelayBuffer, begin: int) -> TracedDelay:
         rows = slice(self.rows.start - begin, self.rows.stop - begin)
         shape = len(self.rows), len(self.columns)
         delay = TracedDelay(self.tracer, lambda: self.leaf(lambda: buffer._total[rows].expand(shape)[None]), buffer)
         self._delays.append((delay, lambda: buffer.history()[:, rows].expand(-1, *shape)))
         return delay
+
+
+def _place(tensor: torch.Tensor) -> tuple:
+    return tensor.data_ptr(), tensor.shape, tensor.dtype
+
+
+def _numbers(
+    true: Mapping, key: Any, rows: slice, columns: torch.Tensor | None, shape: tuple[int, int]
+) -> torch.Tensor:
+    """What a tensor now holds of some rows and joints, (entries, *shape)."""
+    own = true[key][rows]
+    own = own if columns is None or own.shape[1] == 1 else own[:, columns]
+    return own.permute(2, 0, 1) if own.ndim == 3 else own.to(torch.float64).expand(shape)[None]
 
 
 def commands(env: ManagerBasedEnv, dataset: Commands, name: str) -> torch.Tensor:

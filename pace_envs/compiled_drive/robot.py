@@ -60,7 +60,8 @@ def record_drive(
 
 
 def _hold(joint: OneJoint, sim: _Physics, shift: torch.Tensor) -> None:
-    own = [joint.leaf(lambda i=i: shift[None, :, joint.columns, i]) for i in range(2)]  # type: ignore[misc]
+    columns = joint.columns
+    own = [joint.leaf(lambda i=i: shift[None, :, columns, i]) for i in range(2)]  # type: ignore[misc]
     for field, held in zip((sim.qpos, sim.qvel), joint.held(*own), strict=True):
         field.copy_(held)
 

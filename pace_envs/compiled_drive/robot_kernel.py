@@ -95,7 +95,7 @@ class RobotKernel:
         if not own or holds_loops or sim.cfg.integrator == "implicit":
             raise NotTraceableError("a simulation of the user's own")
         self._env, self._dataset, self._kernels, self._course = env, dataset, kernels, course
-        self._flags: object = None
+        self._branches: object = None
         self._programs: list[Program] = []
         self._source: RobotSource
         self._series: torch.Tensor
@@ -107,16 +107,16 @@ class RobotKernel:
         return self._kernels.pays(self._source.source, steps * self._env.cfg.decimation)
 
     def record(self, with_torques: bool = False) -> None:
-        """Record what the drives do, unless that was recorded with the same flags.
+        """Record what the drives do, unless that was recorded with the same branches.
 
         Args:
             with_torques: Whether the motors' torques are shown, too.
         """
         robot = self._env.scene["robot"]
-        flags = [with_torques, *(actuator.flags() for actuator in robot.actuators.values())]
-        if flags == self._flags:
+        branches = [with_torques, *(actuator.branches() for actuator in robot.actuators.values())]
+        if branches == self._branches:
             return
-        self._flags = flags
+        self._branches = branches
         drives = robot.actuators.values()
         shift = None if self._course is None else self._course.shift
         self._programs = [record_drive(self._env, self._dataset, each, with_torques, shift) for each in drives]

@@ -9,8 +9,8 @@ of torch, finds their C in one table (``operations``) and notes them on a tape (
 ``host`` compiles for the processor, ``nvrtc`` for a GPU. Multiplications are not fused with additions.
 """
 
-from pace_envs.compiler.host import CannotCompileError, HostKernels, host_kernels
-from pace_envs.compiler.nvrtc import Kernels, kernels_of
+from pace_envs.compiler.host import CannotCompileError, host_kernels
+from pace_envs.compiler.nvrtc import Compiler, kernels_of
 from pace_envs.compiler.tape import NotTraceableError
 
-__all__ = ["CannotCompileError", "HostKernels", "Kernels", "NotTraceableError", "host_kernels", "kernels_of"]
+__all__ = ["CannotCompileError", "Compiler", "NotTraceableError", "host_kernels", "kernels_of"]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch.utils._python_dispatch import _get_current_dispatch_mode_stack
 
 from pace_envs.compiler.host import host_kernels
-from pace_envs.compiler.nvrtc import kernels_of
+from pace_envs.compiler.nvrtc import Compiler, kernels_of
 from pace_envs.compiler.row_operations import on_elements, plan
 from pace_envs.compiler.row_source import SINGLE_WIDTH, Operation, kernels
 from pace_envs.compiler.rows import Array, Mode, RowSpace, elements
@@ -20,16 +20,6 @@ _ROW_WIDTH = 32
 """Threads of a block that has one for each row: few rows spread over the GPU."""
 _SMALLEST = 2
 """Fewer rows than these: an axis of rows cannot be separated from a broadcast one."""
-
-
-class Compiler(Protocol):
-    """Compiles and launches kernels: those of :mod:`pace_envs.compiler`."""
-
-    def compile(self, sources: Sequence[str]) -> None:
-        """Compile those that are new."""
-
-    def launch(self, source: str, threads: int, width: int, arguments: Sequence[Any]) -> None:
-        """Queue one."""
 
 
 class Fusion(Tracer):

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 
-from pace_envs.compiler.host import Argument, as_argument
+from pace_envs.compiler.host import Argument, HostKernels, as_argument
 
 _OPTIONS = ("--fmad=false", "-default-device")
 """A multiplication and an addition are rounded one by one, as on a processor."""
@@ -67,6 +67,9 @@ class Kernels:
         _check(_driver().cuModuleGetFunction(ctypes.byref(function), module, b"simulate"), "finding a kernel")
         self._kept.append(module)
         return function
+
+
+Compiler = HostKernels | Kernels
 
 
 @cache

@@ -33,22 +33,13 @@ class Node:
     """A constant in C."""
 
 
-@dataclass(frozen=True)
-class Ring:
-    """The memory of a delay: so many of the last samples of each joint."""
-
-    length: int
-    interpolation: str
-    parts: int
-
-
 class Tape:
     """Records operations in their order; the same operation on the same numbers is recorded once."""
 
     def __init__(self) -> None:
         """Begin with nothing."""
         self.nodes: list[Node] = []
-        self.rings: list[Ring] = []
+        self.rings: list[int] = []  # how many of the last samples of each joint a delay keeps
         self.knots: list[tuple[float, ...]] = []
         self.series: list[str] = []
         self._known: dict[tuple, Node] = {}
@@ -89,9 +80,9 @@ class Tape:
             self.series.append(name)
         return self.add("series", index=self.series.index(name))
 
-    def ring(self, ring: Ring) -> int:
+    def ring(self, length: int) -> int:
         """A new ring's index."""
-        self.rings.append(ring)
+        self.rings.append(length)
         return len(self.rings) - 1
 
     def knot(self, values: tuple[float, ...], index: Node) -> Node:

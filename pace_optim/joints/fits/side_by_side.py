@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import torch
 
 from pace_actuators.effects import Effect, EffectCfg
-from pace_envs.compiler import CannotCompileError
+from pace_envs.compiler import CannotCompileError, Compiler
 from pace_optim.joints.fits.model import BASE, COLUMN, JointModel
-from pace_optim.joints.simulation.kernel_rollout import Compiler, KernelRollout
+from pace_optim.joints.simulation.kernel_rollout import KernelRollout
 from pace_optim.joints.simulation.problem import TwinProblem
 from pace_optim.problem.rollout import Rollout
 

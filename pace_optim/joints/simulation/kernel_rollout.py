@@ -6,13 +6,14 @@ import contextlib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import torch
 
 from pace_envs.compiled_drive.drive_code import Program
 from pace_envs.compiled_drive.joint_source import joint_source
 from pace_envs.compiled_drive.one_joint import HELD, commands
+from pace_envs.compiler import Compiler
 from pace_optim.joints.simulation.kernel_recorder import record
 from pace_optim.problem.rollout import between_steps
 
@@ -22,16 +23,6 @@ if TYPE_CHECKING:
 _OF_RECORDINGS = ("command", "command_vel", "command_effort", "torque_enable")
 _WIDTH = 32
 """Threads of a block: each goes its way alone, and few blocks spread over the GPU."""
-
-
-class Compiler(Protocol):
-    """Compiles and launches kernels: see :class:`~pace_envs.compiler.Kernels`."""
-
-    def compile(self, sources: Sequence[str]) -> None:
-        """Compile those that are new."""
-
-    def launch(self, source: str, threads: int, width: int, arguments: Sequence[int | torch.Tensor]) -> None:
-        """Queue one."""
 
 
 @dataclass(kw_only=True)
@@ -66,7 +57,7 @@ class KernelRollout:
         """
         self._rollout, self._parts, self._compiler, self._device = rollout, list(parts), compiler, device
         self._groups: list[_Group] = []
-        self._flags: object = None
+        self._branches: object = None
         self._series: dict[tuple[tuple[str, ...], int], torch.Tensor] = {}
         self._streams: list[torch.cuda.Stream] = []
 
@@ -146,11 +137,11 @@ class KernelRollout:
     # ------------------------------------------------------------------ inside
 
     def _record(self) -> None:
-        """Record the control step, unless it has been recorded with the same flags."""
-        flags = [actuator.flags() for actuator in self._rollout.robot.actuators.values()]
-        if flags == self._flags:
+        """Record the control step, unless it has been recorded with the same branches."""
+        branches = [actuator.branches() for actuator in self._rollout.robot.actuators.values()]
+        if branches == self._branches:
             return
-        self._flags, self._groups = flags, []
+        self._branches, self._groups = branches, []
         n, recordings = self._rollout.robot.num_joints, self._rollout.dataset.num_recordings
         for actuator in list(self._rollout.robot.actuators.values()):
             for rows in self._parts:

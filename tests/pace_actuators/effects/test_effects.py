@@ -6,7 +6,7 @@ import pytest
 import torch
 from effect_envs import EFFECTS, Drive
 
-from pace_actuators import clip_effort
+from pace_actuators import ActuatorActions, clip_effort
 from pace_actuators.dc_motor import clip_to_line
 from pace_actuators.effects import (
     Effect,
@@ -429,3 +429,21 @@ def test_rows_begin_anew_at_first_and_after_a_reset_and_say_so_once():
     effect.reset_state(torch.tensor([False, False, True]))
     assert effect.take_new_rows().flatten().tolist() == [False, True, True]
     assert effect.take_new_rows() is None
+
+
+def test_a_step_with_every_effect_is_a_function_of_its_state():
+    cfgs = [EffectCfg(effect=name, values={p.name: p.start for p in get_effect(name).parameters}) for name in EFFECTS]
+    delays = {"delay": 1.3, "max_delay": 4.0, "control_decimation": 2}
+    for changes in (delays, {**delays, "delay_mode": "effort"}, {"drive_dt": 1.5 * DT}):
+        drive, other = (Drive(cfgs, num_envs=2, **changes) for _ in range(2))
+        q, v, target = 0.1 * torch.randn(3, 11, 2, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+        for k in range(5):  # it stops between two runs of the controller, and one environment has just begun anew
+            drive(target[k], q[k], v[k])
+        drive.motor.reset(torch.tensor([False, True]))
+        state = first = drive.motor.snapshot()
+        for k in range(5, 11):
+            torque, state = drive.motor.step(state, ActuatorActions(target[k], None, None), q[k], v[k])
+            other.motor.restore(first)
+            after = [other(target[i], q[i], v[i]) for i in range(5, k + 1)]
+            assert torch.equal(torque, after[-1])
+        assert torch.equal(drive(target[5], q[5], v[5]), after[0]) and float((after[0] - after[-1]).abs().min()) > 1e-3

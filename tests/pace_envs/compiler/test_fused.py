@@ -8,7 +8,7 @@ import pytest
 import torch
 from without_chance import NUM_ENVS, without_chance
 
-from pace_actuators import ActuatorActions, PaceDCMotor, PaceDCMotorCfg
+from pace_actuators import ActuatorActions, DelayBuffer, Effect, PaceDCMotor, PaceDCMotorCfg
 from pace_actuators.effects import EffectCfg, get_effect
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.compiler import host_kernels
@@ -140,10 +140,11 @@ def test_a_drive_is_one_kernel_a_call_with_effects_too(fusion, effects):
     wanted = [EffectCfg(effect=name, values={p.name: p.start for p in get_effect(name).parameters}) for name in effects]
     cfg = PaceDCMotorCfg(joint_names_expr=".*", effects=wanted, physics_dt=0.0025, **DRIVE)
     plain, own = (PaceDCMotor(cfg, ["hip", "knee"], slice(None), N, dtype=torch.float64) for _ in range(2))
-    for each in (*own.delays(), *(own.effects.effects if own.effects else ())):
-        each._on_device = True
-    for buffer in own.delays():
-        buffer._index_lags()
+    for part in own.parts().values():
+        if isinstance(part, Effect | DelayBuffer):
+            part._on_device = True
+        if isinstance(part, DelayBuffer):
+            part._index_lags()
     launched = []
     for k in range(12):
         target, q, v = (0.1 * (k + 1) * numbers(N, 2) * scale for scale in (1.0, 0.9, 3.0))
