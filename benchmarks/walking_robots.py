@@ -306,17 +306,23 @@ def compared(result: dict, truth: dict) -> dict:
 
 def verdict(row: dict, truth: dict) -> str:
     """One word on a case."""
-    names = {}
+    names: dict[str, set[str]] = {}
     for text in row["found"]:
-        name, _, joint = text.partition("@")
-        names.setdefault(name, set()).add(joint)
+        name, joints, *_ = text.split("@")
+        names.setdefault(name, set()).update(joints.split("|"))
     wanted = EFFECTS[truth["hidden"]]
     if not wanted:
         return "right" if not (names or row["links"]) else "false name"
     if not names and not row["links"]:
         return "declared alike" if wanted in json.dumps(row["alike"]) else "not named"
-    only = set(names) == {wanted} and not row["links"]
-    return "named" if only else "named with others" if wanted in names else "wrong name"
+    alike = [name for name in names if wanted in row["alike"].get(name, ())]
+    if wanted not in names and not alike:
+        return "wrong name"
+    if len(names) > 1 or row["links"]:
+        return "named with others"
+    if set(*names.values()) != set(truth["hidden_on"]):
+        return "named on other joints"
+    return "named" if wanted in names else "declared alike"
 
 
 def table(rows: list[dict]) -> str:

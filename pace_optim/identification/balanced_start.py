@@ -42,7 +42,9 @@ def balanced_start(problem: Problem) -> torch.Tensor:
         for j, (values, part) in zip(joints, solved, strict=True):
             if part > _UNEXPLAINED:
                 continue
-            found |= {f"{name}/{problem.joint_names[j]}": value for name, value in zip(_FOUND, values, strict=False)}
+            # one at its bound is not known: from no friction at all, a descent may not get away
+            known = {name: value for name, value in zip(_FOUND, values, strict=False) if value > 0}
+            found |= {f"{name}/{problem.joint_names[j]}": value for name, value in known.items()}
     for i, label in enumerate(space.labels if joints else ()):
         physical[i] = found.get(label, float(physical[i]))
     return space.to_normalised(physical).clamp(-1.0, 1.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from pace_actuators.files import json_text
 from pace_actuators.joint_units import units_for
 from pace_actuators.text import conjoined
 from pace_optim.diagnosis.checks.data_check import DataCheck
+from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.diagnosis.findings.advice import advise
 from pace_optim.diagnosis.findings.result import Diagnosis
 from pace_optim.diagnosis.search.state import Outcome
@@ -142,11 +143,14 @@ def with_refit(diagnosis: Diagnosis, run: FitResult, refit: FitResult, folder: P
     names = [*(link["link"] for link in diagnosis.links), *diagnosis.paying]
     before, after = (each.rmse["validation"][ALL] for each in (run, refit))
     unit = units_for("mrad", run.joint_types)
+    floors = {joint: own.get("floor", math.inf) for joint, own in diagnosis.joints.items()}
+    alike, left = DEFAULT.judging.alike, refit.rmse["validation"]
+    above = {joint for joint, floor in floors.items() if left.get(joint, 0.0) > alike * floor}
     fall = f"With it the whole robot's validation error falls from {1e3 * before:.3g} to {1e3 * after:.3g} {unit}."
     return replace(
         diagnosis,
         summary=f"{diagnosis.summary} {fall}",
-        sizes=[_as_refitted(size, refit) for size in diagnosis.sizes],
+        sizes=[_as_refitted(size, refit, above) for size in diagnosis.sizes],
         runs=[diagnosis.run, str(folder)],
         ladder=[
             {"model": "base model", "validation_rmse": before, "run": diagnosis.run},
@@ -155,8 +159,8 @@ def with_refit(diagnosis: Diagnosis, run: FitResult, refit: FitResult, folder: P
     )
 
 
-def _as_refitted(size: dict[str, Any], refit: FitResult) -> dict[str, Any]:
-    """The size of an effect as the refit of the whole robot has it."""
+def _as_refitted(size: dict[str, Any], refit: FitResult, above: Collection[str]) -> dict[str, Any]:
+    """The size of an effect as the refit of the whole robot has it; stiff and ``above`` the floor: no error bar."""
     name, joint = f"{size['effect']}.{size['parameter']}", size["joint"]
     values = refit.parameters.get(name, {})
     if (key := joint if joint in values else ALL) not in values:
@@ -165,7 +169,7 @@ def _as_refitted(size: dict[str, Any], refit: FitResult) -> dict[str, Any]:
     (parameter,) = (each for each in effect.parameters if each.name == size["parameter"])
     return size | {
         "value": values[key],
-        "std": None if refit.std_means_nothing else refit.std[name][key],
+        "std": None if refit.std_means_nothing or (effect.is_stiff and joint in above) else refit.std[name][key],
         "factor": None if size["factor"] is None else factor_of(effect, parameter, values[key]),
         "at_bound": f"{name}/{key}" in refit.at_bound,
     }

@@ -85,8 +85,8 @@ class Search:
         missed = torch.zeros(len(self.floor))
         for each in branch.rounds:
             missed += torch.tensor([chosen is None for chosen in each.chosen])
-        # how neighbours moved may have hidden it: joints far from the floor get a second attempt
-        open_joints = missed <= (far & cfg.has("second_try"))
+        # how neighbours moved may have hidden it: each joint gets a second attempt
+        open_joints = missed <= int(cfg.has("second_try"))
         # beside a joint that is far from the floor, another's last tenths may come from how that one moves
         alone = depth == 0 and not bool(far.any())
         above = branch.errors.mse.sqrt() > (1.0 if alone else cfg.judging.next_effect) * self.at_floor

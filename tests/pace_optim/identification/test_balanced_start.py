@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from problems import BENCH, CALM, chirp, env_cfg, make_problem, replayed
 
+from pace_optim.identification import balanced_start as module
 from pace_optim.identification.balanced_start import balanced_start
 
 GAINS = {"stiffness": 85.0, "damping": 0.6}
@@ -24,3 +25,13 @@ def test_a_joint_that_hardly_moves_has_a_start_within_its_bounds():
     problem = make_problem(replayed(0 * chirp(1.0), CALM, env_cfg(BENCH), drive=GAINS))
     start = balanced_start(problem)
     assert start.isfinite().all() and (start.abs() <= 1).all()
+
+
+def test_what_the_balance_puts_at_its_bound_keeps_its_start(monkeypatch):
+    solved = np.array([0.05, 3.0, 0.0, 0.0, 0.0])
+    monkeypatch.setattr(module, "bounded_least_squares", lambda *_: (solved, 0.0))
+    problem = make_problem(replayed(chirp(1.0, high=3.0), CALM, env_cfg(BENCH), drive=GAINS))
+    space, (joint,) = problem.space, problem.joint_names
+    usual, values = (space.to_dict(space.to_physical(x)) for x in (space.start, balanced_start(problem)))
+    assert values["armature"][joint] == pytest.approx(0.05) and values["viscous_friction"][joint] == pytest.approx(3.0)
+    assert values["friction"][joint] == usual["friction"][joint] > 0

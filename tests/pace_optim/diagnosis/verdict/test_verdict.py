@@ -95,17 +95,21 @@ def test_the_report_opens_with_the_verdict_its_sizes_and_the_run_that_has_it(tmp
 
 
 def test_a_size_is_that_of_the_whole_robot_s_fit_once_it_is_done(tmp_path):
-    found = Diagnosis(**make_diagnosis() | {"sizes": [SIZE, SIZE | {"effect": "payload", "parameter": "mass"}]})
+    gap, joint = SIZE | {"effect": "backlash", "parameter": "gap"}, SIZE["joint"]
+    others = [SIZE | {"effect": "payload", "parameter": "mass"}, gap]
+    found = Diagnosis(**make_diagnosis() | {"sizes": [SIZE, *others], "joints": {joint: {"floor": 1e-4}}})
+    names = ("torque_gain.gain", "backlash.gap")
     result = SimpleNamespace(
-        rmse={"validation": {"all": 1e-3}},
+        rmse={"validation": {"all": 1e-3, joint: 2e-4}},
         joint_types=["hinge"],
-        parameters={"torque_gain.gain": {"all": 0.5}},
-        std={"torque_gain.gain": {"all": 0.01}},
+        parameters={name: {"all": 0.5} for name in names},
+        std={name: {"all": 0.01} for name in names},
         std_means_nothing=False,
         at_bound=[],
     )
-    first, second = with_refit(found, result, result, tmp_path).sizes
-    assert first == SIZE | {"value": 0.5, "factor": 0.5, "std": 0.01} and second == found.sizes[1]
+    first, second, third = with_refit(found, result, result, tmp_path).sizes
+    assert first == SIZE | {"value": 0.5, "factor": 0.5, "std": 0.01} and second == others[0]
+    assert third["value"] == 0.5 and third["std"] is None  # contacts, and above the floor
 
 
 def ended(problem, final):
