@@ -384,11 +384,17 @@ def _best_load(
 
 
 def _look_alikes(base: _Fitted, joint_of: Mapping[str, str], cfg: LinksCfg) -> dict[str, float]:
-    """The error with each effect on the joint where it would explain most, {effect on joint: RMSE [rad]}."""
+    """The error with each effect on the joint where it would explain most, {effect on joint: RMSE [rad]}.
+
+    An effect of a size that no drive has is not like a link.
+    """
     found, values = dict[str, float](), _values_of(base)
     for effect, joint in joint_of.items():
         alone = base.problem.with_effects([*base.problem.effects, f"{effect}@{re.escape(joint)}"])
-        found[f"{effect} on {joint}"] = _fit(alone, values, cfg).rmse
+        fitted = _fit(alone, values, cfg)
+        own = _values_of(fitted)
+        if all(p.is_plausible(own[f"{effect}.{p.name}"][joint]) for p in get_effect(effect).parameters):
+            found[f"{effect} on {joint}"] = fitted.rmse
     return found
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
+from pace_optim.estimate.error_bars.uncertainty import SURE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +44,7 @@ def doubts(evidence: Evidence, *, cfg: DiagnosisCfg = DEFAULT) -> list[str]:
     """What speaks against naming an effect, each to be read after "but"; none where its name is earned.
 
     An effect is named where it explains most of what lies above the floor without it, and has a size that is typical of
-    drives. Where it does not lead near the floor, its size must also be several error bars from zero, the same in every
+    drives. Where its joint does not end near the floor, its size must also be surely not zero, the same in every
     recording, and away from its bounds. Beside a larger effect it counts only on what that leaves far from the floor.
     For effects beside a larger one, also on other joints of its tree, take up what the model of the larger one gets
     wrong.
@@ -53,9 +54,9 @@ def doubts(evidence: Evidence, *, cfg: DiagnosisCfg = DEFAULT) -> list[str]:
         return ["the error is near the floor without it"]
     if evidence.explained < cfg.verdict.most:
         return [f"it explains {100 * max(0.0, evidence.explained):.0f} % of what lies above the floor"]
-    far = evidence.left + evidence.harm > near
+    far = evidence.left > near
     return [
-        *(["its size is not significant"] if far and evidence.bars < cfg.verdict.bars else []),
+        *(["its size is not significant"] if far and evidence.bars < SURE else []),
         *(["its size differs between recordings"] if far and evidence.uneven > cfg.verdict.uneven else []),
         *(["it is at a bound"] if far and evidence.at_bound else []),
         *(["no drive has such a value"] if evidence.implausible else []),

@@ -49,7 +49,8 @@ def _add(decision: Decision, cfg: DiagnosisCfg) -> Taken:
     trials: list[list[Trial]] = [[] for _ in decision.joints]
     for name, after in decision.after.items():
         for place in decision.places(name):
-            trial = Trial(effect=get_effect(name), joint=place, screen_score=0.0, values={})
+            implausible = place in facts.get("implausible", {}).get(name, ())
+            trial = Trial(effect=get_effect(name), joint=place, screen_score=0.0, values={}, implausible=implausible)
             trials[place].append(trial.judged(before, after, facts["candidates"], facts["first"], cfg=cfg.judging))
     return [None if effect is None else effect.name for effect in choose(trials, cfg=cfg.judging).chosen]
 
