@@ -67,12 +67,12 @@ class VerdictCfg:
     """Whether a name is earned (``judging.naming``), and what a curve must show."""
 
     most: float = 0.75
-    """An effect must explain this part of the squared error above the floor without it, so that it halves the error;
-    wrong links together, and a curve too. A curve takes the place of effects where it does so to what they leave. An
-    effect dominates above this share."""
-    uneven: float = 0.15
-    """A size for each recording would explain no more than this part of what is left. Measured: up to 0.08 for the
-    evenest effect among many others as large together, 0.18 to 0.36 for proxies."""
+    """Wrong links together, and a curve, must explain this part of the squared error above the floor without them, so
+    that they halve the error. A curve takes the place of effects where it does so to what they leave. An effect
+    dominates above this share."""
+    scatter: float = 0.17
+    """A name needs sizes in single recordings that differ by no more than this part of the size (RMS). Measured: up to
+    0.164 for true effects beside others as large together, but for two of 0.22 and 0.28; 0.18 to 0.79 for proxies."""
     reached: float = 0.998
     """Quantile of a variable up to which the knots of a curve reach."""
 

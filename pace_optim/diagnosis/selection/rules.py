@@ -121,11 +121,11 @@ def _name(decision: Decision, cfg: DiagnosisCfg) -> Taken:
 
 
 def _curves(decision: Decision, cfg: DiagnosisCfg) -> Taken:
-    """A curve in place of a joint's effects, where it explains enough, and leaves much less than they do."""
+    """A curve in place of a joint's effects, where it explains enough and leaves less: much less than named ones."""
     ((name, after),), facts = decision.after.items(), decision.facts
     pays = judge(decision.before, after, 0, facts["candidates"], facts["first"], cfg=cfg.judging).significant
     left, base = (max(0.0, mse - facts["floor"] ** 2) for mse in (float(after.mse), facts["base"]))
-    says_more = facts["first"] or left < (1 - cfg.verdict.most) * facts["left"]
+    says_more = left < (1.0 if facts["first"] else 1 - cfg.verdict.most) * facts["left"]
     return [name if pays and says_more and 1 - left / max(base, 1e-30) >= cfg.verdict.most else None]
 
 

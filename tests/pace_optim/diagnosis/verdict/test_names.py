@@ -52,9 +52,15 @@ SURE = Evidence(
     ("changes", "said"),
     [
         ({}, []),
+        ({"left": 40.0}, []),  # it explains more than it leaves
         ({"left": 60.0}, ["it explains 40 % of what lies above the floor"]),
         ({"harm": 40.0}, ["it explains 40 % of what lies above the floor"]),
         ({"bars": 1.9}, ["its size is not significant"]),
+        ({"uneven": 0.9, "left": 10.0, "floor": 0.1}, ["its size differs between recordings"]),
+        (
+            {"uneven": 0.9, "left": 3.0, "floor": 0.1},
+            [],
+        ),  # by 17 % alone, as little is left
         ({"uneven": 0.2}, ["its size differs between recordings"]),
         ({"at_bound": True}, ["it is at a bound"]),
         ({"implausible": True}, ["no drive has such a value"]),
