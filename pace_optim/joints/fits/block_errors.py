@@ -112,10 +112,10 @@ def check_long_enough(
             )
         return
     length = sum(_spans(where)) * control_dt
-    if length < (least := cfg.blocks * cfg.shortest_s):
+    if length < cfg.block_s:
         raise ValueError(
-            f"What was kept for validation lasts {length:.2g} s, too short to judge a model by; expected {least:g} s "
-            "or more. Record for longer, or fit again with further recordings as --validation."
+            f"What was kept for validation lasts {length:.2g} s, too short to judge a model by; expected "
+            f"{cfg.block_s:g} s or more. Record for longer, or fit again with further recordings as --validation."
         )
 
 

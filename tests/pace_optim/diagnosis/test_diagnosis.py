@@ -159,10 +159,10 @@ def test_a_leg_that_hardly_swings_has_one_block_which_judges_nothing():
 
 def test_recordings_too_short_to_judge_by_are_refused(tmp_path):
     where = torch.zeros(400, 2, dtype=torch.bool)
-    where[:400, 0] = where[100:300:2, 1] = True
+    where[:200, 0] = where[100:301:2, 1] = True
     check_long_enough(where, 0.0025)
     where[100:, 0] = False
-    with pytest.raises(ValueError, match=r"lasts 0\.75 s, .* expected 1\.5 s or more\. Record for .*--validation"):
+    with pytest.raises(ValueError, match=r"lasts 0\.75 s, .* expected 1 s or more\. Record for .*--validation"):
         check_long_enough(where, 0.0025)
     run = hidden_run(tmp_path, None, duration=2.5)
     data = run.problem.dataset
