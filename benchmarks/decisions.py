@@ -2,7 +2,7 @@
 
 python benchmarks/hidden_effects.py --cases effects,clean --seeds 5
 python benchmarks/decisions.py logs/hidden_effects/bench_battery/*.jsonl
-python benchmarks/decisions.py logs/hidden_effects/bench_battery/*.jsonl --numbers judging.alike=1.05 verdict.bars=0
+python benchmarks/decisions.py logs/hidden_effects/bench_battery/*.jsonl --numbers judging.alike=1.05 verdict.scatter=.1
 python benchmarks/decisions.py logs/hidden_effects/*/*.jsonl --save reference.jsonl.gz
 """
 

@@ -95,11 +95,13 @@ def _far_spring(rng: np.random.Generator) -> Law:
 
 def _lag(rng: np.random.Generator) -> Law:
     time_constant = rng.uniform(0.003, 0.008)
+    weight = -math.expm1(-PLANT_DT / time_constant)
+    mean_weight = 1 - weight * time_constant / PLANT_DT
 
     def lagging(tau: float, s: State) -> float:
         before = s.memory.get("tau", tau)
-        s.memory["tau"] = before + (tau - before) * PLANT_DT / time_constant
-        return s.memory["tau"]
+        s.memory["tau"] = before + (tau - before) * weight
+        return before + (tau - before) * mean_weight
 
     return Law(torque=lagging)
 

@@ -73,6 +73,11 @@ class EffectParameter:
     """Whether its bounds, start and probes are those of a loop of ``PROBED_STIFFNESS``, and grow with the stiffness of
     the joint's loop: what yields in a transmission has the size of its drive."""
 
+    def is_plausible(self, value: Any) -> Any:
+        """Whether a drive can have it, element by element of a tensor."""
+        least, most = self.plausible
+        return (value >= least) & (value <= most)
+
     def on_loop(self, stiffness: float) -> EffectParameter:
         """The parameter on a joint with a position loop of a stiffness kp [N m/rad].
 

@@ -44,10 +44,8 @@ class CandidatesCfg:
 class JudgingCfg:
     """When one model of a joint is better than another, and when they are alike; ratios are of validation RMSE."""
 
-    fewest: int = 4
-    """Fewer blocks of time than this show nothing."""
     level: float = 0.02
-    """Chance of a false alarm over all that was tried."""
+    """Chance of a false alarm over all that was tried; of a fall that is ``clear`` that of one trial."""
     alike: float = 1.10
     """Models up to this ratio apart are alike: the first effect must bring more, and effects within it are
     reported together. Of these, the simplest is taken: with the fewest parameters, or with one value for all joints.
@@ -55,9 +53,7 @@ class JudgingCfg:
     next_effect: float = 1.25
     """What each further effect must bring: nearer to the floor than this none could."""
     clear: float = 1.5
-    """A fall that is this large only needs t > ``clear_t``."""
-    clear_t: float = 2.0
-    """See ``clear``."""
+    """A fall that is this large need not stand out of all that was tried."""
     far: float = 3.0
     """A joint is far from the floor above this many times it: more is missing. An effect comes near to another one up
     to this ratio apart. A joint is held at the robot's delay where a separate delay leaves an error this many times
@@ -71,14 +67,12 @@ class VerdictCfg:
     """Whether a name is earned (``judging.naming``), and what a curve must show."""
 
     most: float = 0.75
-    """An effect must explain this part of the squared error above the floor without it, so that it halves the error;
-    wrong links together, and a curve too. A curve takes the place of effects where it does so to what they leave. An
-    effect dominates above this share."""
-    bars: float = 5.0
-    """So many of its error bars an effect's size is away from none, ..."""
-    uneven: float = 0.15
-    """and a size for each recording would explain no more than this part of what is left. Measured: up to 0.08 for the
-    evenest effect among many others as large together, 0.18 to 0.36 for proxies."""
+    """Wrong links together, and a curve, must explain this part of the squared error above the floor without them, so
+    that they halve the error. A curve takes the place of effects where it does so to what they leave. An effect
+    dominates above this share."""
+    scatter: float = 0.17
+    """A name needs sizes in single recordings that differ by no more than this part of the size (RMS). Measured: up to
+    0.164 for true effects beside others as large together, but for two of 0.22 and 0.28; 0.18 to 0.79 for proxies."""
     reached: float = 0.998
     """Quantile of a variable up to which the knots of a curve reach."""
 

@@ -68,7 +68,7 @@ def search_effects(
     fits = fits or fits_on("cpu", cfg.fitting)
     carried = problem.dataset.carried
     free = None if carried is None else carried.free
-    check_long_enough(problem.dataset.validation, problem.control_dt, cfg.judging.fewest, free=free, cfg=cfg.fitting)
+    check_long_enough(problem.dataset.validation, problem.control_dt, free=free, cfg=cfg.fitting)
 
     # the base model of each joint, and what these recordings can show beside it
     twins, base, effort = fit_base(fits, problem, physical, candidates, say, own)

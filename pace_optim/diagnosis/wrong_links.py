@@ -26,7 +26,7 @@ import torch
 
 from pace_actuators.drive_result import LinkInertia
 from pace_actuators.effects import effect_cfgs, get_effect
-from pace_actuators.text import plural
+from pace_actuators.text import conjoined, plural
 from pace_envs.link_inertia import NAMES, OF_BODY, PARTS, TEN, UNITS, Reference
 from pace_envs.tasks.pace import sought_links
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg, LinksCfg
@@ -148,9 +148,12 @@ def find_wrong_links(
     if now.rmse > cfg.judging.far * noise or part < cfg.verdict.most:
         return LinkFindings()
     say("fitting the links that may be wrong")
-    likes = _look_alikes(base, joint_of or {}, own)
-    left = max(now.rmse, noise)
-    if any(rmse * alike < left for rmse in likes.values()):
+    joint_of, left = joint_of or {}, max(now.rmse, noise)
+    likes = _look_alikes(base, {effect: [joint] for effect, joint in joint_of.items()}, own)
+    better = list(likes.values())
+    if left > alike * noise:  # more is missing: an effect on every joint may be what the links stand for
+        better += _look_alikes(base, dict.fromkeys(joint_of, problem.joint_names), own).values()
+    if any(rmse * alike < left for rmse in better):
         return LinkFindings()
     if likes := {name: rmse for name, rmse in likes.items() if rmse <= alike * left}:
         names = ", ".join(reference.link for reference in found)
@@ -377,12 +380,19 @@ def _best_load(
     return float(falls[k]), [float(masses[k]), *best[k].tolist()]
 
 
-def _look_alikes(base: _Fitted, joint_of: Mapping[str, str], cfg: LinksCfg) -> dict[str, float]:
-    """The error with each effect on the joint where it would explain most, {effect on joint: RMSE [rad]}."""
+def _look_alikes(base: _Fitted, joints_of: Mapping[str, Sequence[str]], cfg: LinksCfg) -> dict[str, float]:
+    """The error with each effect on some joints, {effect on joints: RMSE [rad]}.
+
+    An effect of a size that no drive has is not like a link.
+    """
     found, values = dict[str, float](), _values_of(base)
-    for effect, joint in joint_of.items():
-        alone = base.problem.with_effects([*base.problem.effects, f"{effect}@{re.escape(joint)}"])
-        found[f"{effect} on {joint}"] = _fit(alone, values, cfg).rmse
+    for effect, joints in joints_of.items():
+        there = "|".join(map(re.escape, joints))
+        fitted = _fit(base.problem.with_effects([*base.problem.effects, f"{effect}@{there}"]), values, cfg)
+        sizes = _values_of(fitted)
+        own = [(p, sizes[f"{effect}.{p.name}"][joint]) for p in get_effect(effect).parameters for joint in joints]
+        if all(p.is_plausible(size) for p, size in own):
+            found[f"{effect} on {conjoined(joints)}"] = fitted.rmse
     return found
 
 

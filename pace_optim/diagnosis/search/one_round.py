@@ -45,11 +45,14 @@ def try_effects(search: Search, branch: Branch, rough: bool = False) -> Round | 
     after = dict(zip(begun, fits.validation_errors(problem, fitted), strict=True))
     trials: list[list[Trial]] = [[] for _ in range(now.model.num_joints)]
     for effect, fitted_with in models.items():
+        implausible = fitted_with.model.implausible(fitted_with.physical)[fitted_with.model.effects.index(effect)]
         for j in now.model.allowed_joints(effect).nonzero()[:, 0].tolist():
             own = fitted_with.physical[j, fitted_with.model.columns(effect)].tolist()
             values = dict(zip([p.name for p in effect.parameters], own, strict=True))
             score = max(float(probe.score[j]) for probe in probes if probe.effect is effect)
-            trials[j].append(Trial(effect=effect, joint=j, screen_score=score, values=values))
+            trials[j].append(
+                Trial(effect=effect, joint=j, screen_score=score, values=values, implausible=bool(implausible[j]))
+            )
     return replace(round_of(search, trials, errors, after, first), models=models)
 
 
@@ -82,6 +85,11 @@ def round_of(
         {effect.name: [t.joint for own in trials for t in own if t.effect is effect] for effect in after},
         candidates=tried,
         first=first,
+        implausible={
+            effect.name: own
+            for effect in after
+            if (own := [p for p, j in enumerate(joints) for t in trials[j] if t.effect is effect and t.implausible])
+        },
         **facts,
     )
     chosen = (found.chosen[j] for j in joints)

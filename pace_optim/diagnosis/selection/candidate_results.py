@@ -22,6 +22,8 @@ class Trial:
     joint: int
     screen_score: float
     values: dict[str, float]
+    implausible: bool = False
+    """Whether its size is one that no drive has."""
     mse_before: float = 0.0
     """On validation [rad²]."""
     mse_after: float = 0.0

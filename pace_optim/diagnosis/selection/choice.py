@@ -19,6 +19,9 @@ def _near(trials: Sequence[Trial], ratio: float) -> list[Trial]:
 def choose(trials: Sequence[Sequence[Trial]], *, cfg: JudgingCfg = DEFAULT.judging) -> Round:
     """Each joint's best significant effect; among rivals, the one that most joints want, and the simplest.
 
+    Effects that leave as little error are alike as far as a drive can have their sizes: one of a size that no drive has
+    is no rival of those.
+
     Args:
         trials: Of each joint.
         cfg: What is alike.
@@ -26,6 +29,7 @@ def choose(trials: Sequence[Sequence[Trial]], *, cfg: JudgingCfg = DEFAULT.judgi
     refused = _worse_for_the_robot(trials)
     ordered = [sorted(own, key=lambda trial: trial.mse_after) for own in trials]
     near = [_near([t for t in own if t.significant and t.effect not in refused], cfg.alike) for own in ordered]
+    near = [[trial for trial in close if not trial.implausible] or close for close in near]
     wanted = Counter(trial.effect for close in near for trial in close)
     chosen: list[type[Effect] | None] = [None] * len(near)
     rivals: list[list[type[Effect]]] = [[] for _ in near]

@@ -46,7 +46,8 @@ def judge(
 
     Neighbouring samples are alike, blocks hardly: the mean of the blocks' log(MSE before / MSE after),
     and that of MSE before - MSE after, are held against their scatter. The threshold is Student's for the chance that
-    the best of ``tried`` candidates looks this good by luck in either of them.
+    the best of ``tried`` candidates looks this good by luck in either of them. For a clear fall it is that of a single
+    test.
 
     Args:
         before: The present model's errors.
@@ -60,18 +61,14 @@ def judge(
     known = ~before.square[:, joint].isnan()
     old, new = before.square[known, joint], after.square[known, joint]
     logs = (old.clamp(min=1e-30) / new.clamp(min=1e-30)).log()
-    count = len(logs)
-    if count < cfg.fewest:
-        return Judgement(ratio=ratio, t=0.0, significant=False)
     falls = (old - new) / before.mse[joint]
     # the first sees a small fall everywhere, the second a large one somewhere
     t = max(_t(logs), _t(falls))
-    threshold = float(stats.t.isf(cfg.level / (2 * max(1, tried)), count - 1))
-    least = least_ratio(first, cfg=cfg)
-    enough = t > threshold or (ratio >= cfg.clear and t > cfg.clear_t)
-    return Judgement(ratio=ratio, t=t, significant=ratio >= least and enough)
+    tests = 1 if ratio >= cfg.clear else 2 * max(1, tried)
+    threshold = float(stats.t.isf(cfg.level / tests, max(1, len(logs) - 1)))
+    return Judgement(ratio=ratio, t=t, significant=ratio >= least_ratio(first, cfg=cfg) and t > threshold)
 
 
 def _t(values: torch.Tensor) -> float:
-    """Mean over its standard error."""
-    return float(values.mean() / (values.std() / math.sqrt(len(values))).clamp(min=1e-12))
+    """Mean over its standard error; 0 of a single value."""
+    return 0.0 if len(values) < 2 else float(values.mean() / (values.std() / math.sqrt(len(values))).clamp(min=1e-12))

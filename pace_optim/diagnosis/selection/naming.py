@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
+from pace_optim.estimate.error_bars.uncertainty import SURE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,12 +40,23 @@ class Evidence:
         before, after = (max(0.0, each - self.floor) for each in (self.without, self.left))
         return 1 - (after + self.harm) / max(before, 1e-30)
 
+    @property
+    def scatter(self) -> float:
+        """RMS by which its sizes in single recordings differ from its size, as a part of that.
+
+        Separate sizes would explain a part u of what is left, e². The effect explains g² - e² of the g² without it, and
+        a size that differs by a part s explains s² of that:
+
+            s = √(u e² / (g² - e²))
+        """
+        return math.sqrt(max(0.0, self.uneven) * self.left / max(self.without - self.left, 1e-30))
+
 
 def doubts(evidence: Evidence, *, cfg: DiagnosisCfg = DEFAULT) -> list[str]:
     """What speaks against naming an effect, each to be read after "but"; none where its name is earned.
 
-    An effect is named where it explains most of what lies above the floor without it, and has a size that is typical of
-    drives. Where it does not lead near the floor, its size must also be several error bars from zero, the same in every
+    An effect is named where it explains more than it leaves of what lies above the floor, and has a size that drives
+    have. Where its joint does not end near the floor, its size must also be surely not zero, the same in every
     recording, and away from its bounds. Beside a larger effect it counts only on what that leaves far from the floor.
     For effects beside a larger one, also on other joints of its tree, take up what the model of the larger one gets
     wrong.
@@ -51,12 +64,12 @@ def doubts(evidence: Evidence, *, cfg: DiagnosisCfg = DEFAULT) -> list[str]:
     near = cfg.judging.far**2 * evidence.floor
     if (evidence.larger or evidence.slight) and evidence.without <= near:
         return ["the error is near the floor without it"]
-    if evidence.explained < cfg.verdict.most:
+    if evidence.explained < 0.5:
         return [f"it explains {100 * max(0.0, evidence.explained):.0f} % of what lies above the floor"]
-    far = evidence.left + evidence.harm > near
+    far = evidence.left > near
     return [
-        *(["its size is not significant"] if far and evidence.bars < cfg.verdict.bars else []),
-        *(["its size differs between recordings"] if far and evidence.uneven > cfg.verdict.uneven else []),
+        *(["its size is not significant"] if far and evidence.bars < SURE else []),
+        *(["its size differs between recordings"] if far and evidence.scatter > cfg.verdict.scatter else []),
         *(["it is at a bound"] if far and evidence.at_bound else []),
         *(["no drive has such a value"] if evidence.implausible else []),
     ]

@@ -49,7 +49,8 @@ def _add(decision: Decision, cfg: DiagnosisCfg) -> Taken:
     trials: list[list[Trial]] = [[] for _ in decision.joints]
     for name, after in decision.after.items():
         for place in decision.places(name):
-            trial = Trial(effect=get_effect(name), joint=place, screen_score=0.0, values={})
+            implausible = place in facts.get("implausible", {}).get(name, ())
+            trial = Trial(effect=get_effect(name), joint=place, screen_score=0.0, values={}, implausible=implausible)
             trials[place].append(trial.judged(before, after, facts["candidates"], facts["first"], cfg=cfg.judging))
     return [None if effect is None else effect.name for effect in choose(trials, cfg=cfg.judging).chosen]
 
@@ -120,11 +121,11 @@ def _name(decision: Decision, cfg: DiagnosisCfg) -> Taken:
 
 
 def _curves(decision: Decision, cfg: DiagnosisCfg) -> Taken:
-    """A curve in place of a joint's effects, where it explains enough, and leaves much less than they do."""
+    """A curve in place of a joint's effects, where it explains enough and leaves less: much less than named ones."""
     ((name, after),), facts = decision.after.items(), decision.facts
     pays = judge(decision.before, after, 0, facts["candidates"], facts["first"], cfg=cfg.judging).significant
     left, base = (max(0.0, mse - facts["floor"] ** 2) for mse in (float(after.mse), facts["base"]))
-    says_more = facts["first"] or left < (1 - cfg.verdict.most) * facts["left"]
+    says_more = left < (1.0 if facts["first"] else 1 - cfg.verdict.most) * facts["left"]
     return [name if pays and says_more and 1 - left / max(base, 1e-30) >= cfg.verdict.most else None]
 
 

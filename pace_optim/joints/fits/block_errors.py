@@ -66,9 +66,9 @@ def block_errors(
 def _free_errors(
     error: torch.Tensor, where: torch.Tensor, weight: torch.Tensor, control_dt: float, cfg: FittingCfg
 ) -> BlockErrors:
-    """Errors of joints that are free at times: the free time of each, in so many blocks or fewer; 1 where it has none.
+    """Errors of joints that are free at times: the free time of each, in so many blocks; 1 where it has none.
 
-    A leg that hardly swings has few blocks: samples of one swing are alike.
+    A leg that hardly swings has one block, which compares nothing: samples of one swing are alike.
     """
     own = [(where & (weight[..., j] > 0)).T.nonzero() for j in range(weight.shape[2])]
     count = cfg.blocks  # for all joints: models are compared block by block
@@ -77,15 +77,10 @@ def _free_errors(
         if len(places):
             r, k = places.T
             errors = (error[k, r, j] / weight[k, r, j]).double().square()
-            own_count = min(count, max(1, int(len(places) * control_dt / cfg.swing_s + 1e-9)))
+            own_count = count if len(places) * control_dt >= count * cfg.swing_s else 1
             square[:own_count, j] = torch.stack([part.mean() for part in errors.tensor_split(own_count)])
             square[own_count:, j] = torch.nan
     return BlockErrors(square=square, weight=torch.ones(count, dtype=torch.float64))
-
-
-def _free_blocks(usual: float, cfg: FittingCfg) -> int:
-    """How many blocks the free time of the median joint makes [s]."""
-    return max(1, int(usual / min(cfg.block_s, max(cfg.swing_s, usual / cfg.blocks)) + 1e-9))
 
 
 def _usual_time(samples: Sequence[int], control_dt: float) -> float:
@@ -94,14 +89,13 @@ def _usual_time(samples: Sequence[int], control_dt: float) -> float:
 
 
 def check_long_enough(
-    where: torch.Tensor, control_dt: float, fewest: int, *, free: torch.Tensor | None = None, cfg: FittingCfg = DEFAULT
+    where: torch.Tensor, control_dt: float, *, free: torch.Tensor | None = None, cfg: FittingCfg = DEFAULT
 ) -> None:
     """See that recordings are long enough to judge by.
 
     Args:
         where: Which samples count, (T, R) bool.
         control_dt: [s].
-        fewest: How many blocks are needed.
         free: Where joints are free, (T, R, n) bool; ``None``: everywhere.
         cfg: How long they are.
 
@@ -111,18 +105,17 @@ def check_long_enough(
     if free is not None:
         samples = (free & where[..., None]).sum(dim=(0, 1)).tolist()
         usual = _usual_time(samples, control_dt)
-        if _free_blocks(usual, cfg) < fewest:
+        if usual < (least := cfg.blocks * cfg.swing_s):
             raise ValueError(
                 f"In the held-out data, the median joint swings for {usual:.2g} s, too short to judge a model by. "
-                f"Expected {fewest * cfg.swing_s:g} s or more. Walk for longer, or fit again with further recordings "
-                "as --validation."
+                f"Expected {least:g} s or more. Walk for longer, or fit again with further recordings as --validation."
             )
         return
-    if (count := len(_blocks(where, control_dt, cfg))) < fewest:
+    length = sum(_spans(where)) * control_dt
+    if length < cfg.block_s:
         raise ValueError(
-            f"What was kept for validation has {count} pieces of {_block_length(where, control_dt, cfg):.2g} s, too "
-            f"few to judge a model by; expected {fewest} or more. Record for longer, or fit again with further "
-            "recordings as --validation."
+            f"What was kept for validation lasts {length:.2g} s, too short to judge a model by; expected "
+            f"{cfg.block_s:g} s or more. Record for longer, or fit again with further recordings as --validation."
         )
 
 

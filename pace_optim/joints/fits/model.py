@@ -299,8 +299,7 @@ class JointModel:
         result = torch.zeros_like(self.has)
         for row, (effect, has) in enumerate(zip(self.effects, self.has, strict=True)):
             for column, parameter in enumerate(effect.parameters, start=self.columns(effect).start):
-                least, most = parameter.plausible
-                result[row] |= has & ((physical[:, column] < least) | (physical[:, column] > most))
+                result[row] |= has & ~parameter.is_plausible(physical[:, column])
         return result
 
     def at_point(self, effect: type[Effect], values: Mapping[str, float]) -> torch.Tensor:

@@ -230,6 +230,14 @@ def test_of_two_effects_that_are_alike_the_one_with_fewer_numbers_is_taken(elast
     assert (choice.chosen, choice.rivals) == ([chosen], [rivals])
 
 
+def test_an_effect_of_a_size_that_no_drive_has_is_no_rival_of_a_plausible_one():
+    """A negative gravity compensation stood before a payload."""
+    negative, payload = (make_trial(get_effect(n), 0, 1e-4) for n in ("gravity_compensation", "payload"))
+    negative = replace(negative, implausible=True, mse_after=0.9 * payload.mse_after)
+    assert choose([[negative, payload]]).chosen == [payload.effect] and choose([[negative, payload]]).rivals == [[]]
+    assert choose([[negative]]).chosen == [negative.effect]  # a hint, as nothing else comes near
+
+
 def test_a_rival_that_is_chosen_makes_the_one_before_its_rival_and_is_none_of_its_own():
     this = Round(trials=[[], [], []], chosen=[GAIN, GAIN, None], rivals=[[STRIBECK, QUADRATIC], [STRIBECK], []])
     other = this.choosing([STRIBECK, QUADRATIC, GAIN])

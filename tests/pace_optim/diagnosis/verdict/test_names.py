@@ -52,15 +52,21 @@ SURE = Evidence(
     ("changes", "said"),
     [
         ({}, []),
+        ({"left": 40.0}, []),  # it explains more than it leaves
         ({"left": 60.0}, ["it explains 40 % of what lies above the floor"]),
         ({"harm": 40.0}, ["it explains 40 % of what lies above the floor"]),
-        ({"bars": 4.0}, ["its size is not significant"]),
+        ({"bars": 1.9}, ["its size is not significant"]),
+        ({"uneven": 0.9, "left": 10.0, "floor": 0.1}, ["its size differs between recordings"]),
+        (
+            {"uneven": 0.9, "left": 3.0, "floor": 0.1},
+            [],
+        ),  # by 17 % alone, as little is left
         ({"uneven": 0.2}, ["its size differs between recordings"]),
         ({"at_bound": True}, ["it is at a bound"]),
         ({"implausible": True}, ["no drive has such a value"]),
         ({"left": 8.0, "bars": 0.0, "uneven": 1.0, "at_bound": True}, []),  # it explains everything
         ({"left": 4.0, "implausible": True}, ["no drive has such a value"]),  # a proxy near the floor
-        ({"left": 8.0, "harm": 2.0, "at_bound": True}, ["it is at a bound"]),
+        ({"left": 8.0, "harm": 2.0, "uneven": 1.0}, []),  # what it does to other joints is no doubt about its size
         ({"without": 8.0, "left": 1.0}, []),  # the first one of a joint
         ({"without": 8.0, "left": 1.0, "slight": True}, ["the error is near the floor without it"]),
         ({"without": 8.0, "left": 1.0, "larger": 600.0}, ["the error is near the floor without it"]),
