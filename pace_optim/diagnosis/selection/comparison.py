@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from scipy import stats
+from scipy.special import stdtrit
 
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, JudgingCfg
 from pace_optim.joints.fits.block_errors import BlockErrors
@@ -66,7 +66,7 @@ def judge(
     falls = (old - new) / before.mse[joint]
     # the first sees a small fall everywhere, the second a large one somewhere
     t = max(_t(logs), _t(falls))
-    threshold = float(stats.t.isf(cfg.level / (2 * max(1, tried)), count - 1))
+    threshold = -float(stdtrit(count - 1, cfg.level / (2 * max(1, tried))))
     least = least_ratio(first, cfg=cfg)
     enough = t > threshold or (ratio >= cfg.clear and t > cfg.clear_t)
     return Judgement(ratio=ratio, t=t, significant=ratio >= least and enough)
