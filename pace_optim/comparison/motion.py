@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import signal
+
+from .low_pass import low_passed
 
 _CUTOFF = 30.0
 """Of the smoothing [Hz]."""
@@ -41,8 +42,7 @@ def motion_of(position: np.ndarray, dt: float, sigma: float) -> Motion:
     """
     nyquist = 0.5 / dt
     cutoff = min(_CUTOFF, 0.4 * nyquist)
-    filter_ = signal.butter(3, cutoff / nyquist, output="sos")
-    smooth = signal.sosfiltfilt(filter_, position, padlen=min(len(position) - 1, round(3 / (cutoff * dt))))
+    smooth = low_passed(position, dt, cutoff)
     speed = np.gradient(smooth, dt)
     # white noise of this sigma, differentiated below the cutoff
     speed_noise = sigma * 2 * np.pi * cutoff * np.sqrt(cutoff / (3 * nyquist))

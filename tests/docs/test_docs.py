@@ -30,10 +30,14 @@ def blocks(page: Path, language: str | None = None) -> list[tuple[str, str]]:
     return [(kind, text) for kind, text in found if language in (None, kind)]
 
 
-def type_in(warm: WarmPython, page: Path, home: Path, start: Path) -> str:
-    """Run all blocks of a page in one shell, as a reader who starts in the checkout would."""
-    script = ["set -eo pipefail"]
+def type_in(warm: WarmPython, name: str, home: Path, start: Path, shorter: dict[str, str]) -> str:
+    """Run all blocks of a page in one shell, as a reader who starts in the checkout would, with shorter motions."""
+    page, script = ROOT / "docs" / name, ["set -eo pipefail"]
+    for long in shorter:
+        assert any(long in text for _, text in blocks(page)), f"{name} has no {long!r} that could be shorter"
     for i, (kind, text) in enumerate(blocks(page)):
+        for long, short in shorter.items():
+            text = text.replace(long, short)
         if any(not (ROOT / path).exists() for path in re.findall(r"scripts/\w+\.py", text)):
             continue  # not there yet
         script.append(f"echo '>>> block {i}'")
@@ -59,32 +63,33 @@ def type_in(warm: WarmPython, page: Path, home: Path, start: Path) -> str:
 
 @pytest.mark.slow
 def test_the_tutorial_for_an_own_robot_works_when_typed(warm, tmp_path):
-    printed = type_in(warm, ROOT / "docs" / "your_own_robot.md", tmp_path, ROOT)
+    shorter = {"--duration 6": "--duration 2", "--duration 3": "--duration 1.5"}
+    printed = type_in(warm, "your_own_robot.md", tmp_path, ROOT, shorter)
     assert "replay: " in printed
     assert list(tmp_path.glob("my_arm/logs/pace/my_arm/*/result.json"))
 
 
 @pytest.mark.slow
 def test_the_tutorial_for_an_own_objective_works_when_typed(warm, tmp_path):
-    type_in(warm, ROOT / "docs" / "your_own_objective.md", tmp_path, ROOT)
+    type_in(warm, "your_own_objective.md", tmp_path, ROOT, {})
 
 
 @pytest.mark.slow
 def test_the_tutorial_for_an_own_effect_works_when_typed(warm, tmp_path):
-    printed = type_in(warm, ROOT / "docs" / "your_own_effect.md", tmp_path, ROOT)
+    printed = type_in(warm, "your_own_effect.md", tmp_path, ROOT, {})
     assert "mrad without the cable" in printed
     assert "verdict: effect\nMissing: cable_drag. On held-out" in printed
 
 
 @pytest.mark.slow
 def test_the_tutorial_for_a_walking_robot_works_when_typed(warm, tmp_path):
-    printed = type_in(warm, ROOT / "docs" / "walking.md", tmp_path, ROOT)
+    printed = type_in(warm, "walking.md", tmp_path, ROOT, {"simulate(4.0)": "simulate(2.0)"})
     assert "verdict: nothing_missing" in printed
 
 
 @pytest.mark.slow
 def test_the_page_for_users_of_pace_works_when_typed(warm, tmp_path):
-    printed = type_in(warm, ROOT / "docs" / "coming_from_pace.md", tmp_path, ROOT)
+    printed = type_in(warm, "coming_from_pace.md", tmp_path, ROOT, {"--duration 1 ": "--duration 0.4 "})
     assert "plot: " in printed and "objective my_optimizers:Weighted" in printed
 
 
