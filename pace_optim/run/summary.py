@@ -65,7 +65,8 @@ def next_line(result: FitResult, folder: Path, *, compared: bool = False) -> lis
     run = shlex.quote(str(folder))
     if result.times_noise < ABOVE_NOISE:
         fmt, ending = ("cfg", "drives.py") if result.effects else ("mjcf", "identified.xml")  # MJCF has few effects
-        return [f"next: {command('export')} {run} --format {fmt} --output {shlex.quote(f'{result.robot_name}_{ending}')}"]
+        file = shlex.quote(f"{result.robot_name}_{ending}")
+        return [f"next: {command('export')} {run} --format {fmt} --output {file}"]
     verb = "diagnose" if compared or (result.std_means_nothing and not result.effects) else "compare"
     return [f"next: {command(verb)} {run}"]
 

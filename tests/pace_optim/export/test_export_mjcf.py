@@ -296,12 +296,14 @@ def test_a_model_whose_meshes_are_missing_is_written_without_them(tmp_path):
 
 def test_joints_without_drives_rub_as_in_the_fit(tmp_path):
     path = tmp_path / "arm.xml"
-    flap = '<body><joint name="flap" frictionloss="0.01"/><inertial pos="0 0 0.01" mass="0.1" diaginertia="1 1 1"/></body>'
+    inertial = '<inertial pos="0 0 0.01" mass="0.1" diaginertia="1 1 1"/>'
+    flap = f'<body><joint name="flap" frictionloss="0.01"/>{inertial}</body>'
     path.write_text(STIFF.replace("</body></body>", f"{flap}</body></body>"))
     cfg = cfg_from_model(path)
     value = dict.fromkeys(cfg.sim2real.joint_order, 0.1)
     parameters = dict.fromkeys(("armature", "viscous_friction", "friction", "encoder_bias"), value)
-    exported = export(result_of(tmp_path, path, cfg, parameters, dict.fromkeys(("stiffness", "damping"), value)), "mjcf")
+    gains = dict.fromkeys(("stiffness", "damping"), value)
+    exported = export(result_of(tmp_path, path, cfg, parameters, gains), "mjcf")
     model = mujoco.MjModel.from_xml_string(exported.text)
     assert list(value) == ["shoulder", "wrist"] and model.dof_frictionloss.tolist() == [0.1, 0.1, 0.01]
     assert np.ptp(model.dof_solref, axis=0).max() == 0.0 == np.ptp(model.dof_solimp, axis=0).max()

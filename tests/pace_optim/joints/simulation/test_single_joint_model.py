@@ -133,7 +133,9 @@ RUBBING = FOUR_BAR.replace('"rocker"', '"rocker" frictionloss="0.02"')
 LEANING = FINGER.replace('stiffness="0.02"', 'stiffness="0.2"')
 
 
-@pytest.mark.parametrize("model", [FOUR_BAR, SPRUNG, RUBBING, LEANING], ids=["four_bar", "sprung", "rubbing", "leaning"])
+@pytest.mark.parametrize(
+    "model", [FOUR_BAR, SPRUNG, RUBBING, LEANING], ids=["four_bar", "sprung", "rubbing", "leaning"]
+)
 def test_a_crank_feels_what_follows_it(tmp_path, model):
     """Inertia, springs and friction of joints without drives, along the loop that they close.
 
