@@ -76,6 +76,6 @@ def test_friction_of_mujocos_default_creeps(tmp_path):
 def test_soft_friction_moves_as_mujocos_own(friction_time_constant, tmp_path, monkeypatch):
     folder = written(tmp_path, monkeypatch, {}, friction_time_constant)
     values = {"time_constant": friction_time_constant}
-    with_it, without = error(folder, ["soft_friction"], values, physics_dt=0.0003125), error(folder)
+    with_it, without = error(folder, ["soft_friction"], values, physics_dt=0.000625), error(folder)
     assert without > 1e-3
     assert with_it < 0.15 * without
