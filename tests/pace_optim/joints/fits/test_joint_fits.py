@@ -188,7 +188,7 @@ def test_steps_with_the_last_derivatives_go_the_rest_of_the_way(bench):
     assert torch.equal(looked.x, start.x) and torch.equal(led.jacobian, looked.jacobian)
     assert float((led.x - truth).abs().max()) < 0.1 * float((start.x - truth).abs().max())
     assert led.error == pytest.approx(FITS.trained_errors(bench.twins, led), abs=1e-7)
-    assert float(FITS.to_the_end(bench.twins, start).score) <= float(led.score)
+    assert float(FITS.to_the_end(bench.twins, start).score) <= (1 + 1e-3) * float(led.score)
 
 
 def test_models_far_behind_are_left_at_the_coarse_step(bench):

@@ -7,6 +7,7 @@ import torch
 
 from pace_optim.joints.fits.fits import Fits
 from pace_optim.joints.fits.fitted import Fitted
+from pace_optim.joints.fits.fitting_cfg import FittingCfg
 from pace_optim.joints.fits.model import BASE, JointModel
 
 SAMPLES, TRUTH = 400, torch.tensor([0.3, -0.2, 0.5, 0.1, -0.4], dtype=torch.float64)
@@ -79,5 +80,5 @@ def test_on_smooth_ground_both_end_at_the_same_place_and_stop(fitted):
 def test_steps_end_narrow_where_the_ground_is_bent(fitted):
     narrow, _ = fitted(0.0, rough=False, bend=0.5)
     wide, landscape = fitted(0.0, rough=True, bend=0.5)
-    assert landscape.step == pytest.approx(1e-4)
+    assert landscape.step == pytest.approx(FittingCfg().narrow)
     assert float((narrow - wide).abs().max()) < 1e-3  # both end where less than a 3000th of the score is to be gained
