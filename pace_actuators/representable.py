@@ -78,11 +78,11 @@ def check_representable(drives: IdentifiedDrives, world: World = HERE) -> list[s
         if any(kind.overrides(stage) for stage in ("feedback", "friction", "transmission")):
             if not world.friction_per_step:
                 raise ValueError(
-                    f"{kind.name} changes the joint's friction at every physics step, which {world.name} cannot do. "
+                    f"{kind.name} acts on the joint at every physics step, which {world.name} cannot do. "
                     "Fit again without it, or train elsewhere."
                 )
             if world.friction_hook:
-                notes.append(f"{kind.name} changes the joint's friction at every physics step: {world.friction_hook}.")
+                notes.append(f"{kind.name} acts on the joint at every physics step: {world.friction_hook}.")
     return notes
 
 

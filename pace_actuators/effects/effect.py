@@ -414,12 +414,15 @@ class Effect(Part):
 
 
 def comb_grid(effect: type[Effect], span: float) -> torch.Tensor:
-    """Frequencies of an effect with a comb, (points,) [1/rev], half a period over the span of motion [rad] apart."""
+    """Frequencies of an effect with a comb, (points,) [1/rev]: from one period in the span of motion [rad], every half.
+
+    What has less than a period there is a spring or an offset to the recording.
+    """
     if effect.comb is None:
         raise ValueError(f"The effect {effect.name!r} has no frequency to scan.")
     own = next(p for p in effect.parameters if p.name == effect.comb[0])
     step = math.pi / max(span, 1e-3)
-    return torch.arange(own.lower, own.upper, step, dtype=torch.float64)
+    return torch.arange(min(max(own.lower, 2 * step), own.upper - step), own.upper, step, dtype=torch.float64)
 
 
 PROBED_STIFFNESS = 85.0

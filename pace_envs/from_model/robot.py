@@ -298,8 +298,9 @@ def _assumptions(joints: Sequence[JointFacts], key: str, model: mujoco.MjModel, 
     notes = [f"home posture: {f'keyframe {key}' if key else middle}"]
     if not all(has_gains(joint) for joint in joints):
         notes.append(
-            f"gains: the recording's; if it states none, kp = effort limit / {defaults.ERROR_AT_LIMIT:g} rad, at least "
-            f"{defaults.NATURAL_FREQUENCY:g} Hz, and kd for a damping ratio of {defaults.DAMPING_RATIO:g}"
+            "gains: the file has none; a recording that has none gets kp = effort limit / "
+            f"{defaults.ERROR_AT_LIMIT:g} rad, at least {defaults.NATURAL_FREQUENCY:g} Hz, and kd for a damping ratio "
+            f"of {defaults.DAMPING_RATIO:g}"
         )
     without = [joint.name for joint in joints if not np.isfinite(joint.effort_limit)]
     if without:
@@ -348,8 +349,8 @@ def _degrees_note(joints: Sequence[JointFacts], file: ModelFile) -> list[str]:
 
 def _loop_note(joints: Sequence[JointFacts], model: mujoco.MjModel, control_dt: float) -> str:
     if runs_continuously(joints, model, control_dt):
-        return "drive loops: continuous, as MuJoCo holds the file's gains, unless --drive_dt states a period"
-    return "drive loops: at the control rate with a held torque, unless --drive_dt states a period"
+        return "drive loops: their period is --drive_dt; without it they are continuous, as MuJoCo's gains are"
+    return "drive loops: their period is --drive_dt; without it they hold a torque for a control step"
 
 
 def _folder_name(file: ModelFile) -> str:

@@ -53,7 +53,8 @@ class JudgingCfg:
     next_effect: float = 1.25
     """What each further effect must bring: nearer to the floor than this none could."""
     clear: float = 1.5
-    """A fall that is this large need not stand out of all that was tried."""
+    """A fall that is this large need not stand out of all that was tried. Something is missing on a joint that ends
+    this many times above its floor."""
     far: float = 3.0
     """A joint is far from the floor above this many times it: more is missing. An effect comes near to another one up
     to this ratio apart. A joint is held at the robot's delay where a separate delay leaves an error this many times

@@ -13,6 +13,8 @@ from pace_optim.terminal.cli import command
 
 ABOVE_NOISE = 1.5
 """Times the noise above which an error has causes beside it."""
+_FEW = 6
+"""Values of an effect that a line shows; curves have more."""
 
 
 def summary(result: FitResult) -> list[str]:
@@ -21,7 +23,9 @@ def summary(result: FitResult) -> list[str]:
     lines: list[str] = []
     for joint_type in JOINT_TYPES:
         joints = [joint for joint in result.joint_names if result.joint_type(joint) == joint_type]
-        lines += _table(result, result.joint_parameters, joints, joint_type, width)
+        base = [name for name in result.joint_parameters if "." not in name]
+        lines += _table(result, base, joints, joint_type, width)
+    lines += _effects(result)
     lines += _links(result)
     for name, values in result.parameters.items():
         if set(values) == {ALL}:
@@ -93,6 +97,22 @@ def _table(result: FitResult, names: list[str], joints: list[str], joint_type: J
     aligned = [[cell.rjust(max(map(len, column))) for cell in column] for column in columns]
     rows = zip([name.ljust(width) for name in ("joint", *joints)], *aligned, strict=True)
     return [*("  ".join(row) for row in rows), ""]
+
+
+def _effects(result: FitResult) -> list[str]:
+    """The effects of joints, a line for each joint that has one."""
+    rows: dict[tuple[str, str], list[str]] = {}
+    for name in result.joint_parameters:
+        effect, _, parameter = name.partition(".")
+        for joint in result.parameters[name] if parameter else ():
+            text = f"{parameter} {_value(result, name, joint)} {result.unit_of(name, joint)}".removesuffix(" 1")
+            rows.setdefault((effect, joint), []).append(text)
+    if not rows:
+        return []
+    cells = [(*key, ", ".join(v) if len(v) <= _FEW else f"{len(v)} values: see the report") for key, v in rows.items()]
+    table = [("effect", "joint", "values"), *cells]
+    first, second = (max(len(row[i]) for row in table) for i in (0, 1))
+    return [*(f"{effect:<{first}}  {joint:<{second}}  {values}" for effect, joint, values in table), ""]
 
 
 def _links(result: FitResult) -> list[str]:

@@ -22,7 +22,8 @@ def verdict(outcome: Outcome, floor: torch.Tensor, named: torch.Tensor) -> tuple
     """The verdict, and the outcome with the effects and curves that stand.
 
     ``effect`` where effects are named on some joints; others then have the base model, or a curve. Else ``unknown``
-    where a joint is far from the floor or has something that lowers its error, which stays; else ``nothing_missing``.
+    where a joint ends clearly above the floor or has something that lowers its error, which stays; else
+    ``nothing_missing``.
 
     Args:
         outcome: Where the search ended.
@@ -34,7 +35,8 @@ def verdict(outcome: Outcome, floor: torch.Tensor, named: torch.Tensor) -> tuple
     if bool(named.any()):
         return "effect", _restricted(outcome, named | with_curve)
     hinted = new_effects(outcome, outcome.final.model).any(dim=0)
-    return "unknown" if bool((outcome.far(floor) | with_curve | hinted).any()) else "nothing_missing", outcome
+    above = outcome.final_errors.mse.sqrt() > outcome.cfg.judging.clear * floor
+    return "unknown" if bool((above | with_curve | hinted).any()) else "nothing_missing", outcome
 
 
 def part_explained(outcome: Outcome, floor: torch.Tensor) -> float:

@@ -209,13 +209,18 @@ def test_a_limit_that_the_recording_contradicts_is_the_first_warning(tmp_path):
     assert warnings[0] == told and len(warnings) > 1
 
 
-def test_an_effect_that_some_joints_have_leaves_the_cells_of_the_others_empty():
+def test_effects_have_a_line_for_each_joint_below_the_table():
     plain = make_result()
     one, *others = plain.joint_names
-    label = "stribeck_friction.effort"
-    more = {"effects": [f"stribeck_friction@{one}"], "units": {**plain.units, label: "N m"}}
-    result = make_result(
-        parameters={**plain.parameters, label: {one: 1.5}}, std={**plain.std, label: {one: 0.1}}, **more
-    )
-    first, *rest = (line for line in summary(result) if line.split()[:1] in [[j] for j in plain.joint_names])
-    assert "1.5 ± 0.1" in first and len(rest) == len(others) and all(" - " in line for line in rest)
+    curve = {f"torque_over_position.effort_{i}": {others[0]: 0.1} for i in range(17)}
+    more = {"stribeck_friction.effort": {one: 1.5}, "proportional_gain.gain": {one: 0.9}, **curve}
+    units = {**plain.units, **dict.fromkeys(more, "N m"), "proportional_gain.gain": "1"}
+    std = {**plain.std, **{name: dict.fromkeys(values, 0.1) for name, values in more.items()}}
+    lines = summary(make_result(parameters={**plain.parameters, **more}, std=std, units=units, effects=[]))
+    named = [line.split() for line in lines if line.startswith(("stribeck", "proportional", "torque_over"))]
+    assert named == [
+        ["stribeck_friction", one, "effort", "1.5", "±", "0.1", "N", "m"],
+        ["proportional_gain", one, "gain", "0.9", "±", "0.1"],
+        ["torque_over_position", others[0], *"17 values: see the report".split()],
+    ]
+    assert "stribeck" not in lines[0]
