@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from scipy import signal
 
 from pace_actuators.identified import DRIVE_FIELDS
 from pace_optim.problem.evaluator import Evaluator
@@ -12,10 +13,7 @@ from pace_optim.problem.inverse_dynamics import LinkMotion, frame_motion, model_
 from pace_optim.problem.problem import Problem
 from pace_optim.run.result import configured_drive
 
-from .low_pass import low_passed
-
 _CUTOFF = 10.0
-"""Of the smoothing [Hz]."""
 
 
 def load_torques(evaluator: Evaluator, encoder_bias: np.ndarray) -> list[np.ndarray]:
@@ -36,13 +34,21 @@ def load_torques(evaluator: Evaluator, encoder_bias: np.ndarray) -> list[np.ndar
     for r, recording in enumerate(rollout.dataset.recordings):
         model = model_of(rollout.env, r)
         dt = float(recording.time[1] - recording.time[0])
-        position = low_passed(recording.dof_pos, dt, _CUTOFF) + encoder_bias
+        position = smoothed(recording.dof_pos, dt) + encoder_bias
         speed = np.gradient(position, dt, axis=0)
         acceleration = np.gradient(speed, dt, axis=0)
         frame = None if recording.frame is None else frame_motion(recording.frame[recording.sample_steps], dt)
         point = recording.frame_point
         result.append(LinkMotion.of(model, joints, position, speed, acceleration).torque(frame, point))
     return result
+
+
+def smoothed(position: np.ndarray, dt: float) -> np.ndarray:
+    """Positions (K, n) low-passed without delay."""
+    nyquist = 0.5 / dt
+    cutoff = min(_CUTOFF, 0.4 * nyquist)
+    filter_ = signal.butter(3, cutoff / nyquist, output="sos")
+    return signal.sosfiltfilt(filter_, position, axis=0, padlen=min(len(position) - 1, round(3 / (cutoff * dt))))
 
 
 _STRIDE = 10
@@ -65,7 +71,7 @@ def drive_loads(problem: Problem, evaluator: Evaluator, encoder_bias: np.ndarray
     result = []
     for r, recording in enumerate(rollout.dataset.recordings):
         dt = float(np.median(np.diff(recording.time)))
-        position = low_passed(recording.dof_pos, dt, _CUTOFF)
+        position = smoothed(recording.dof_pos, dt)
         speed = np.gradient(position, dt, axis=0)
         here = recording.sample_steps
         facts = {name: _in_force(getattr(recording.drive, name), configured[name]) for name in DRIVE_FIELDS}

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtrc
+from scipy import stats
 
 from pace_actuators.joint_units import JointType
 from pace_optim.recording.noise import NoiseFloor, noise_floor, with_repetitions
@@ -50,7 +50,7 @@ def whiteness(error: np.ndarray, dt: float) -> dict[str, Any]:
         "lag_1": float(rho[1]),
         "predictable": float(rho[1] ** 2),
         "correlation_time": dt * (1 + 2 * float(rho[1:end].sum())),
-        "ljung_box": {"q": q, "lags": lags, "p": float(chdtrc(lags, q))},
+        "ljung_box": {"q": q, "lags": lags, "p": float(stats.chi2.sf(q, lags))},
         "lag": drawn * dt,
         "autocorrelation": rho[drawn],
     }

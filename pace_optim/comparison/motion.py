@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-
-from .low_pass import low_passed
+from scipy import signal
 
 _CUTOFF = 30.0
 """Of the smoothing [Hz]."""
@@ -42,7 +41,8 @@ def motion_of(position: np.ndarray, dt: float, sigma: float) -> Motion:
     """
     nyquist = 0.5 / dt
     cutoff = min(_CUTOFF, 0.4 * nyquist)
-    smooth = low_passed(position, dt, cutoff)
+    filter_ = signal.butter(3, cutoff / nyquist, output="sos")
+    smooth = signal.sosfiltfilt(filter_, position, padlen=min(len(position) - 1, round(3 / (cutoff * dt))))
     speed = np.gradient(smooth, dt)
     # white noise of this sigma, differentiated below the cutoff
     speed_noise = sigma * 2 * np.pi * cutoff * np.sqrt(cutoff / (3 * nyquist))

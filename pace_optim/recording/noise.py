@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
 import numpy as np
+from scipy import signal
 
 from pace_optim.recording.data import Recording
 
@@ -122,13 +123,12 @@ def _spectral_sigma(position: np.ndarray, dt: float) -> float:
     # differences take the motion's power away before it can leak; dividing by their gain gives the spectrum back
     whitened = np.diff(position, _DIFFERENCES)
     segment = min(_SEGMENT, len(whitened) // 4 * 2)
-    frequency = np.fft.rfftfreq(segment, dt)
+    frequency, _, segments = signal.spectrogram(
+        whitened, 1 / dt, window="hann", nperseg=segment, noverlap=segment // 2, detrend=False, mode="psd"
+    )
+    density = np.quantile(segments, _QUIET, axis=1) / -np.log(1 - _QUIET)
     omega = 2 * np.pi * frequency * dt
     keep = slice(1, -1)  # the ends are estimated from half as many numbers
-    hann = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(segment) / segment)
-    pieces = np.lib.stride_tricks.sliding_window_view(whitened, segment)[:: segment // 2]
-    segments = 2 * dt * np.abs(np.fft.rfft(pieces * hann)) ** 2 / (hann @ hann)
-    density = np.quantile(segments, _QUIET, axis=0) / -np.log(1 - _QUIET)
     omega, width = omega[keep], float(frequency[1] - frequency[0])
     density = density[keep] / (2 * np.sin(omega / 2)) ** (2 * _DIFFERENCES)
     if density.max() * width < _NUMERICAL**2:

@@ -37,9 +37,8 @@ def test_the_docs_import_from_the_packages_alone(page):
     assert found <= {*api.PACKAGES, *ADAPTERS}
 
 
-def test_importing_what_is_public_loads_what_is_slow_only_when_it_is_used():
-    code = "import pace_optim, sys; assert 'torch' not in sys.modules; pace_optim.fit; sys.modules['torch']; "
-    code += "assert not {'scipy.signal', 'scipy.stats'} & set(sys.modules), 'they take a third of a second'"
+def test_importing_what_is_public_loads_torch_only_when_it_is_used():
+    code = "import pace_optim, sys; assert 'torch' not in sys.modules; pace_optim.fit; sys.modules['torch']"
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
 
 

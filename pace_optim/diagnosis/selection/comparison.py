@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from scipy.special import stdtrit
+from scipy import stats
 
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, JudgingCfg
 from pace_optim.joints.fits.block_errors import BlockErrors
@@ -65,7 +65,7 @@ def judge(
     # the first sees a small fall everywhere, the second a large one somewhere
     t = max(_t(logs), _t(falls))
     tests = 1 if ratio >= cfg.clear else 2 * max(1, tried)
-    threshold = -float(stdtrit(max(1, len(logs) - 1), cfg.level / tests))
+    threshold = float(stats.t.isf(cfg.level / tests, max(1, len(logs) - 1)))
     return Judgement(ratio=ratio, t=t, significant=ratio >= least_ratio(first, cfg=cfg) and t > threshold)
 
 

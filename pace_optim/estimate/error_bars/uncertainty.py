@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy import fft
+from scipy import signal
 
 from pace_optim.estimate.derivatives import Colouring, Jacobian
 from pace_optim.problem.evaluator import Residuals
@@ -249,8 +249,7 @@ def autocovariance(error: np.ndarray) -> np.ndarray:
         error: (T,).
     """
     count = len(error)
-    size = fft.next_fast_len(2 * count, real=True)
-    full = fft.irfft(np.abs(fft.rfft(error, size)) ** 2, size)[:count] / count
+    full = signal.correlate(error, error, mode="full", method="fft")[count - 1 :] / count
     if full[0] <= 0:
         return np.zeros(1)
     quiet = np.abs(full / full[0]) < 2 / np.sqrt(count)
@@ -258,8 +257,7 @@ def autocovariance(error: np.ndarray) -> np.ndarray:
     lags = np.flatnonzero(np.convolve(quiet[: count // 4], np.ones(run), mode="valid") == run)
     last = int(lags[0]) if len(lags) else count // 4
     length = min(count // 4, 3 * last) if last > 1 else 1
-    share = np.arange(length + 1) / (length + 0.5)
-    taper = np.where(share <= 0.5, 1 - 6 * share**2 + 6 * share**3, 2 * (1 - share) ** 3)
+    taper = signal.windows.parzen(2 * length + 1)[length:]
     return (full[: length + 1] * taper)[: max(1, length)]
 
 
@@ -295,12 +293,7 @@ def sandwich(columns: np.ndarray, error: np.ndarray, prior: float = np.inf) -> n
 def filtered(columns: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Σ applied to each row of (entries, T), Σ the Toeplitz matrix of an autocovariance."""
     kernel = np.concatenate([covariance[:0:-1], covariance])
-    if len(kernel) == 1:
-        return columns * kernel
-    count = columns.shape[1]
-    size = fft.next_fast_len(count + len(kernel) - 1, real=True)
-    both = fft.rfft(columns, size, axis=1) * fft.rfft(kernel, size)
-    return fft.irfft(both, size, axis=1)[:, len(covariance) - 1 :][:, :count]
+    return signal.fftconvolve(columns, kernel[None, :], mode="same", axes=1) if len(kernel) > 1 else columns * kernel
 
 
 def _trees(colouring: Colouring, free: np.ndarray) -> list[list[int]]:
