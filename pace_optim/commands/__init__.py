@@ -12,10 +12,7 @@ from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from pace_optim.terminal.cli import USER_ERROR, run_cli
-
-_SPELT = {"import_log": "import"}
-"""Verbs that are no good name for a module."""
+from pace_optim.terminal.cli import SPELT, USER_ERROR, run_cli, spelt
 
 
 def main() -> int:
@@ -28,13 +25,13 @@ def main() -> int:
         print(f"pace-mujoco {package_version()}")
         return 0
     verb = words[0].replace("-", "_")
-    verb = next((name for name, spelt in _SPELT.items() if spelt == verb), verb)
+    verb = next((name for name, other in SPELT.items() if other == verb), verb)
     if verb not in verbs():
         close = difflib.get_close_matches(verb, verbs(), n=1)
-        meant = f"; did you mean {_spelt(close[0])}?" if close else "."
+        meant = f"; did you mean {spelt(close[0])}?" if close else "."
         print(f"error: there is no command {words[0]!r}{meant} See pace --help.", file=sys.stderr)
         return USER_ERROR
-    sys.argv = [f"pace {_spelt(verb)}", *words[1:]]
+    sys.argv = [f"pace {spelt(verb)}", *words[1:]]
     return run_cli(import_module(f"{__name__}.{verb}").main)
 
 
@@ -56,13 +53,9 @@ def _first_line(file: Path) -> str:
     return text.partition("\n")[0]
 
 
-def _spelt(verb: str) -> str:
-    return _SPELT.get(verb, verb).replace("_", "-")
-
-
 def _help() -> list[str]:
     width = max(len(verb) for verb in verbs())
-    lines = [f"  {_spelt(verb):<{width}}  {what}" for verb, what in verbs().items()]
+    lines = [f"  {spelt(verb):<{width}}  {what}" for verb, what in verbs().items()]
     return [
         "usage: pace VERB [options]; pace VERB --help says more",
         "",

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from pace_actuators.drive_result import ALL
+from pace_actuators.text import plural
 from pace_envs.task_source import EnvironmentRecord
 from pace_optim.comparison.drive_loads import drive_loads
 from pace_optim.estimate.derivatives import Jacobian
@@ -150,7 +151,7 @@ def _result(run: Optimization, record: EnvironmentRecord, end: _End, checked: bo
     unsure = [label for label in problem.space.labels if label in open_ and label not in end.left_open]
     rates = None if end.rates is None else end.rates.at(problem.space, physical.numpy())
     told = replace(uncertainty, indistinguishable=()) if end.is_far else uncertainty  # where correlations mean nothing
-    stalled = f"stalled: residual is {end.times or 0.0:,.0f}x the measurement noise"
+    stalled = f"no further progress, at {end.times or 0.0:,.0f} times the measurement noise"
     return make_result(
         problem,
         end.x,
@@ -256,7 +257,8 @@ def _at_prior(run: Optimization, end: _End, cfg: LeastSquaresCfg | None) -> _End
     left_open = undetermined(end.problem, end.x, end.uncertainty, end.is_far)
     if not left_open:
         return end
-    run.progress.say(f"fitting again with what the recordings do not determine at its prior: {len(left_open)} values")
+    count = plural(len(left_open), "value")
+    run.progress.say(f"fitting again with what the recordings do not determine at its prior: {count}")
     x, left_open = held_at_prior(end.problem, end.x, end.uncertainty, left_open, cfg)
     return replace(end.moved(run, x, left_open), left_open=left_open)
 

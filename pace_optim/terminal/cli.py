@@ -240,11 +240,20 @@ def command(verb: str) -> str:
     return as_called(f"scripts/{verb}.py")
 
 
+SPELT = {"import_log": "import"}
+"""Verbs of the console command whose module has another name."""
+
+
+def spelt(verb: str) -> str:
+    """A command's verb, by the name of its module."""
+    return SPELT.get(verb, verb).replace("_", "-")
+
+
 def as_called(text: str) -> str:
     """The text with the commands in it as the user calls them."""
     if not sys.argv[0].startswith(_CONSOLE):
         return text
-    return re.sub(r"scripts/(\w+)\.py", lambda found: _CONSOLE + found[1].replace("_", "-"), text)
+    return re.sub(r"scripts/(\w+)\.py", lambda found: _CONSOLE + spelt(found[1]), text)
 
 
 class Parser(argparse.ArgumentParser):

@@ -224,7 +224,7 @@ def _at_bounds(problem: Problem, physical: torch.Tensor, uncertainty: Uncertaint
         for (name, side, bound), keys in places.items()
     ]
     return [
-        f"At a bound: {'; '.join(found)}. Widen the bound, or find the missing physics that the value stands in for. "
+        f"At a bound: {'; '.join(found)}. Find the missing physics that the value stands in for, or widen the bound. "
         "[W9]"
     ]
 

@@ -143,7 +143,7 @@ def test_bounds_are_told_with_side_and_value_and_joints_are_gathered():
     told = fit_warnings(problem, at, known(problem, at_bound=labels), FINE)
     assert len(told) == 1 and told[0].startswith(
         "At a bound: friction (upper, 2 N m) of servo; encoder bias (lower, -0.1 rad) of servo; "
-        "delay (upper, 10 control steps). Widen the bound"
+        "delay (upper, 10 control steps). Find the missing physics"
     )
 
 
