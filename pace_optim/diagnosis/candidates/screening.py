@@ -59,7 +59,7 @@ def screen(
     Raises:
         ValueError: If the model was fitted without its Jacobian.
     """
-    error = now.error
+    error, middle = now.error, _middle(problem)
     if error is None:
         raise ValueError("Screening needs a model that was fitted with keep_jacobian.")
 
@@ -73,7 +73,9 @@ def screen(
 
     def look_at(own: Sequence[type[Effect]]) -> list[list[Probe]]:
         result: dict[type[Effect], list[Probe]] = {effect: [] for effect in own}
-        points = [each for effect in own if effect.comb is None for each in probe_values(effect, effort, now.model)]
+        points = [
+            each for effect in own if effect.comb is None for each in probe_values(effect, effort, now.model, middle)
+        ]
         if points:
             scores, sizes = explained(points)
             for (effect, values), score, size in zip(points, scores, sizes[:, 0], strict=True):
@@ -114,7 +116,8 @@ def absorbed_effects(
     beside = now.x.repeat(len(takers), 1, 1)
     for row, taker in enumerate(takers):
         beside[row, :, taker] += steps[:, taker]
-    probes = [each for effect in suspects for each in probe_values(effect, effort, now.model)]
+    middle = _middle(problem)
+    probes = [each for effect in suspects for each in probe_values(effect, effort, now.model, middle)]
     changes, _ = simulated_changes(fits, problem, now, probes, beside)
     jacobian = now.free_jacobian
     for taker, change in zip(takers, changes[: len(takers)], strict=True):
@@ -151,7 +154,7 @@ def _comb_probes(
     frequency = torch.stack([torch.cat([own, own[-1:].expand(count - len(own))]) for own in grids], dim=1)
     names = [p.name for p in effect.parameters]
     place, *amplitudes = (names.index(name) for name in effect.comb)
-    (_, first), (_, second) = probe_values(effect, effort, now.model)
+    (_, first), (_, second) = probe_values(effect, effort, now.model, _middle(problem))
     scores, sizes = [], []
     for part in frequency.split(cfg.at_once):
         pairs = [(effect, each.index_fill(1, torch.tensor([place]), 0.0)) for _ in part for each in (first, second)]
@@ -200,17 +203,24 @@ def simulated_changes(
     return errors[1:] - errors[:1], batch.dataset.train
 
 
+def _middle(problem: TwinProblem) -> torch.Tensor:
+    """Of the range in which each joint was measured, (n,) [rad]."""
+    seen = problem.dataset.measured[problem.dataset.sampled]
+    return 0.5 * (seen.amax(dim=0) + seen.amin(dim=0))
+
+
 def probe_values(
-    effect: type[Effect], effort: torch.Tensor, model: JointModel
+    effect: type[Effect], effort: torch.Tensor, model: JointModel, middle: torch.Tensor
 ) -> list[tuple[type[Effect], torch.Tensor]]:
     """An effect's probes on a model's joints with a typical torque, (n,) [N m]: physical values, (n, parameters) each.
 
-    Torques are small for small drives.
+    Torques are small for small drives. Positions are counted from the middle of each joint's motion, (n,) [rad].
     """
     small = (effort / PROBED_EFFORT).clamp(max=1.0)[:, None]
     torques = torch.tensor([p.unit == "N m" and p.null == 0.0 for p in effect.parameters])
     size = torch.where(torques, small, 1.0)
-    return [(effect, size * model.at_point(effect, point)) for point in probe_points(effect)]
+    positions = torch.tensor([float(p.is_position) for p in effect.parameters]) * middle[:, None]
+    return [(effect, size * model.at_point(effect, point) + positions) for point in probe_points(effect)]
 
 
 def starts_of(probe: Probe, cfg: CandidatesCfg) -> torch.Tensor:
