@@ -165,7 +165,7 @@ def model_of(source: Path) -> tuple[mujoco.MjSpec, list[str]]:
     """
     if source.suffix == ".urdf":
         file = read_model_file(source, touches=True)
-        return file.spec, [*file.notes, *_exclude_overlaps(file.spec)]
+        return file.spec, [*file.notes, *_exclude_overlaps(file.spec, source)]
     spec = mujoco.MjSpec.from_file(str(source))
     if not (missing := missing_files(spec, source)):
         return spec, []
@@ -173,9 +173,9 @@ def model_of(source: Path) -> tuple[mujoco.MjSpec, list[str]]:
     return read_model_file(source).spec, [f"{len(missing)} files of the model are missing ({named}): left out."]
 
 
-def _exclude_overlaps(spec: mujoco.MjSpec) -> list[str]:
+def _exclude_overlaps(spec: mujoco.MjSpec, source: Path) -> list[str]:
     """Let bodies pass through each other that overlap where all joints are at their zero."""
-    model = compile_model(spec, spec.modelname)
+    model = compile_model(spec, source)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     pairs = {tuple(sorted(int(model.geom_bodyid[g]) for g in contact.geom)) for contact in data.contact}
