@@ -83,7 +83,7 @@ def test_the_tutorial_for_an_own_effect_works_when_typed(warm, tmp_path):
 
 @pytest.mark.slow
 def test_the_tutorial_for_a_walking_robot_works_when_typed(warm, tmp_path):
-    printed = type_in(warm, "walking.md", tmp_path, ROOT, {"simulate(4.0)": "simulate(2.5)"})
+    printed = type_in(warm, "walking.md", tmp_path, ROOT, {})
     assert "verdict: nothing_missing" in printed
 
 

@@ -192,7 +192,10 @@ def test_a_fit_begins_in_the_valley_of_a_comb():
 
 def test_a_grid_of_a_comb_is_finer_than_a_period_over_the_range():
     grid = comb_grid(RIPPLE, 2.0)
-    assert float(grid.diff().max()) == pytest.approx(math.pi / 2) and float(grid[0]) == RIPPLE.parameters[2].lower
+    assert float(grid.diff().max()) == pytest.approx(math.pi / 2)
+    assert float(grid[0]) == pytest.approx(math.pi)  # one period in the range
+    assert float(comb_grid(RIPPLE, 6.0)[0]) == RIPPLE.parameters[2].lower
+    assert len(comb_grid(RIPPLE, 0.01)) == 1
     with pytest.raises(ValueError, match="no frequency"):
         comb_grid(FADE, 2.0)
 

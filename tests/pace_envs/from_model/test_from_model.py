@@ -170,7 +170,7 @@ def test_limits_and_dynamics_of_a_urdf_are_read_and_its_meshes_are_not_needed(tm
     assert cfg.sim2real.joint_order == ("hip", "knee")  # the toe follows the knee
     assert drive.effort_limit == [23.7, 35.5] and drive.velocity_limit == [30.1, 20.1]
     assert any("meshes are not loaded" in note for note in cfg.sim2real.notes)
-    assert any(note.startswith("gains: the recording's; if") for note in cfg.sim2real.notes)
+    assert any(note.startswith("gains: the file has none") for note in cfg.sim2real.notes)
     env = made(cfg)
     robot = env.scene["robot"]
     assert robot.data.joint_pos_limits.tolist() == [[-1.5, 1.5], [-2.5, 0]]
@@ -288,7 +288,7 @@ def test_the_gains_around_motors_are_somebody_elses(tmp_path):
     cfg = cfg_of(tmp_path, motors)
     assert cfg.sim2real.assumed_gains == cfg.sim2real.joint_order
     assert min(drive_of(cfg).stiffness) > 0.0 and min(drive_of(cfg).damping) > 0.0
-    assert any("states none, kp = effort limit" in note for note in cfg.sim2real.notes)
+    assert any("has none gets kp = effort limit" in note for note in cfg.sim2real.notes)
     assert not drive_of(cfg).implicit and cfg.sim.integrator == "leapfrog"
 
 

@@ -158,7 +158,7 @@ def test_least_squares_in_a_wrong_valley_is_not_converged(tmp_path):
     assert result.times_noise > 10 and result.std_means_nothing
     assert all(std is None for each in result.std.values() for std in each.values()) and not result.step_error
     assert all(entry is None for row in result.correlation["matrix"] for entry in row)
-    assert "converged" not in result.stop_reasons and "x the measurement noise" in result.stop_reasons[-1]
+    assert "converged" not in result.stop_reasons and "times the measurement noise" in result.stop_reasons[-1]
     assert "times the measurement noise" in result.warnings[0]
     assert "± ?" in "\n".join(summary(result))
 
