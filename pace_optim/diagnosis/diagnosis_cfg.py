@@ -117,7 +117,7 @@ class LinksCfg:
     """Candidates of a round that are fitted, ..."""
     of_link: int = 3
     """and so many of them of one link."""
-    iterations: int = 8
+    iterations: int = 15
     """Of each fit, at most."""
     most: int = 3
     """Wrong links, at most."""
