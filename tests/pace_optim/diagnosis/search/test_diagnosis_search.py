@@ -10,7 +10,7 @@ from diagnoses import FITS, errors_of, joint_alone, make_search, make_trial, out
 from problems import DT
 
 from pace_actuators.effects import get_effect
-from pace_optim.diagnosis.candidates.screening import absorbed_effects
+from pace_optim.diagnosis.candidates.screening import absorbed_effects, probe_values
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.diagnosis.findings.advice import advise, rivals
 from pace_optim.diagnosis.search.replace_effect import exchanged, replace_effects
@@ -244,3 +244,12 @@ def test_a_rival_that_is_chosen_makes_the_one_before_its_rival_and_is_none_of_it
     assert other.chosen == [STRIBECK, QUADRATIC, GAIN]
     assert other.rivals == [[QUADRATIC, GAIN], [STRIBECK], []]
     assert this.chosen == [GAIN, GAIN, None] and this.rivals == [[STRIBECK, QUADRATIC], [STRIBECK], []]
+
+
+def test_the_rest_of_a_spring_is_sought_around_the_middle_of_the_motion(bench):
+    """Two springs alike: the one at rest at -2.2 rad was not found from rests at -1, 0 and 1 rad."""
+    spring, middle = get_effect("parallel_spring"), torch.tensor([-2.2], dtype=torch.float64)
+    probes = probe_values(spring, torch.ones(1), JointModel.base(bench.problem), middle)
+    stiffness, rest = torch.stack([values[0] for _, values in probes]).double().T
+    assert sorted(rest.tolist()) == pytest.approx([-3.2, -2.2, -1.2])
+    assert float(stiffness.min()) == float(stiffness.max()) > 0.0

@@ -184,11 +184,12 @@ def test_steps_with_the_last_derivatives_go_the_rest_of_the_way(bench):
     truth = model.to_normalised(values)
     values[0, : BASE.index("encoder_bias")] *= 1.03
     start = Fitted.start(model, values)
-    looked, led = (FITS.side_by_side(bench.twins, [start], 1, keep_jacobian=True, chords=k)[0] for k in (0, 4))
+    fits = replace(FITS, cfg=replace(FITS.cfg, narrow=1e-4))  # the ground is smooth: narrow derivatives are exact
+    looked, led = (fits.side_by_side(bench.twins, [start], 1, keep_jacobian=True, chords=k)[0] for k in (0, 4))
     assert torch.equal(looked.x, start.x) and torch.equal(led.jacobian, looked.jacobian)
     assert float((led.x - truth).abs().max()) < 0.1 * float((start.x - truth).abs().max())
-    assert led.error == pytest.approx(FITS.trained_errors(bench.twins, led), abs=1e-7)
-    assert float(FITS.to_the_end(bench.twins, start).score) <= (1 + 1e-3) * float(led.score)
+    assert led.error == pytest.approx(fits.trained_errors(bench.twins, led), abs=1e-7)
+    assert float(fits.to_the_end(bench.twins, start).score) <= float(led.score)
 
 
 def test_models_far_behind_are_left_at_the_coarse_step(bench):
