@@ -62,7 +62,8 @@ PRIOR = 0.25
 """The same as part of half a bound range: bounds are four standard deviations from the file's value."""
 _THINNEST = 0.01
 """Smallest radius of gyration of a reference, in parts of the largest: a rod of the file has none across."""
-_FIELDS = ("body_mass", "body_ipos", "body_inertia", "body_iquat")
+FIELDS = ("body_mass", "body_ipos", "body_inertia", "body_iquat")
+"""MuJoCo's fields of a body's inertial parameters."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,17 +206,17 @@ class LinkInertias:
             rows: The simulations.
         """
         for body in bodies:
-            live = {field: self.sim.expand(field) for field in _FIELDS}
+            live = {field: self.sim.expand(field) for field in FIELDS}
             at = live["body_ipos"][rows, body].double()
             if place is not None:
                 at = torch.as_tensor(place, dtype=torch.float64, device=at.device).expand_as(at)
             load = _point(torch.full_like(at[:, 0], mass), at)
             self._load_of(body)[rows] += load
             for source in (live, self._before) if self._before else (live,):
-                fields = {field: source[field][rows, body].double() for field in _FIELDS}
+                fields = {field: source[field][rows, body].double() for field in FIELDS}
                 after = {"body_mass": fields["body_mass"] + mass}
                 if place is not None:
-                    after = _fields_of(_pseudo_inertia(fields) + load)
+                    after = fields_of(pseudo_inertia_of(fields) + load)
                 for field, value in after.items():
                     source[field][rows, body] = value.to(self.sim.dtype)
 
@@ -270,13 +271,13 @@ class LinkInertias:
 
     def _remember(self) -> None:
         """Keep the bodies as they are before the first change."""
-        self._before = self._before or {field: self.sim.expand(field).clone() for field in _FIELDS}
+        self._before = self._before or {field: self.sim.expand(field).clone() for field in FIELDS}
 
     def _write(self, rows: slice, body: int) -> None:
         """Put a body's pseudo-inertia together, and write it."""
         before = {field: value[rows, body].double() for field, value in self._before.items()}
         factor, load = self._factor_of(body)[rows], self._load_of(body)[rows]
-        own, same = _pseudo_inertia(before) - load, factor == 1
+        own, same = pseudo_inertia_of(before) - load, factor == 1
         if body in self._parameters:
             reference, values = self._parameters[body]
             values = values[rows]
@@ -288,8 +289,8 @@ class LinkInertias:
                 angle = turn.angle[rows]
                 move = _turning(turn.axis, turn.anchor[rows], angle)
                 own, same = move @ own @ move.transpose(-1, -2), same & (angle == 0)
-        after = _fields_of(own + load)
-        for field in _FIELDS:
+        after = fields_of(own + load)
+        for field in FIELDS:
             unchanged = same.view(-1, *[1] * (before[field].ndim - 1))
             value = torch.where(unchanged, before[field], after[field])
             self.sim.expand(field)[rows, body] = value.to(self.sim.dtype)
@@ -349,9 +350,9 @@ def _point(mass: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
     return mass[..., None, None] * at[..., :, None] * at[..., None, :]
 
 
-def _pseudo_inertia(fields: Mapping[str, torch.Tensor]) -> torch.Tensor:
+def pseudo_inertia_of(fields: Mapping[str, torch.Tensor]) -> torch.Tensor:
     """J of MuJoCo's fields of a body, (n, 4, 4)."""
-    mass, com, moments, axes = (*(fields[name] for name in _FIELDS[:3]), _matrix(fields["body_iquat"]))
+    mass, com, moments, axes = (*(fields[name] for name in FIELDS[:3]), _matrix(fields["body_iquat"]))
     second = 0.5 * moments.sum(dim=1, keepdim=True) - moments
     about_com = (axes * second[:, None, :]) @ axes.transpose(1, 2)
     result = _point(mass, com)
@@ -359,7 +360,7 @@ def _pseudo_inertia(fields: Mapping[str, torch.Tensor]) -> torch.Tensor:
     return result
 
 
-def _fields_of(j: torch.Tensor) -> dict[str, torch.Tensor]:
+def fields_of(j: torch.Tensor) -> dict[str, torch.Tensor]:
     """MuJoCo's fields of a body with a pseudo-inertia (n, 4, 4)."""
     mass = j[:, 3, 3]
     com = j[:, :3, 3] / mass.clamp(min=1e-300)[:, None]
@@ -368,7 +369,7 @@ def _fields_of(j: torch.Tensor) -> dict[str, torch.Tensor]:
     axes = axes * torch.sign(torch.linalg.det(axes))[:, None, None]
     values = values.clamp(min=0.0)  # of a rod: rounding
     moments = values.sum(dim=1, keepdim=True) - values
-    return dict(zip(_FIELDS, (mass, com, moments, _quaternion(axes)), strict=True))
+    return dict(zip(FIELDS, (mass, com, moments, _quaternion(axes)), strict=True))
 
 
 def _turning(axis: torch.Tensor, anchor: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:

@@ -7,15 +7,25 @@ For each joint, everything but the delay is linear (:mod:`pace_optim.identificat
 The armature a, viscous friction d and Coulomb friction f are a start. The delay is the one that leaves least over all
 joints, δ what it lacks; b takes what encoder biases do to gravity. The smoothing that makes q̈ usable leaves
 errors, of up to a half in a small armature, which the fit takes away.
+
+Links that are sought come first. The torque of a link is linear in its pseudo-inertia J
+(:mod:`pace_envs.link_inertia`), so that of ten point masses on it makes that of any J. The joints' own terms are
+projected out, and τ_links(J(θ)) is fitted by the free parameters θ of all sought links. Without this, armatures and
+frictions take up a tool that the file lacks, and the fit ends in their valley.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
+import mujoco
 import numpy as np
 import torch
+from scipy.optimize import least_squares
 
+from pace_envs.link_inertia import FIELDS, NAMES, PARTS, Reference, fields_of, pseudo_inertia_of
 from pace_envs.tasks.pace import GLOBAL
 from pace_optim.identification.log_checks.balance import FEWEST, Links, View, moving, views_of
 from pace_optim.problem.bounded_least_squares import bounded_least_squares
@@ -24,36 +34,57 @@ from pace_optim.problem.problem import Problem
 _FOUND = ("armature", "viscous_friction", "friction")
 _UNEXPLAINED = 0.5
 """Part of a torque's variance without which a joint keeps its start."""
+_PRIOR = 1e-3
+"""Weight of the prior of links against the whole torque: it holds what the motion does not show."""
+_POINTS = np.array(
+    [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1], [1, 1, 0], [1, 0, 1], [0, 1, 1]]
+)
+"""Places whose point masses make any pseudo-inertia."""
+_UPPER = np.triu_indices(4)
+"""Its ten entries."""
 
 
 def balanced_start(problem: Problem) -> torch.Tensor:
     """The start of the parameters, normalised (size,), with what the training recordings give in its place."""
     views, space = views_of(problem), problem.space
-    seen = [(view, Links.of(view)) for view in (views[r] for r in problem.dataset.trained())]
+    trained, links = [views[r] for r in problem.dataset.trained()], problem.env_cfg.sim2real.links
+    found = _links(trained, links) if links else {}
+    if found:
+        bodies = {each.link: _pseudo_inertia(each, found[each.link]) for each in links}
+        trained = [_with_bodies(view, bodies) for view in trained]
+    seen = [(view, Links.of(view)) for view in trained]
     counts = [moving(view, links) for view, links in seen]
-    joints = [j for j in range(len(problem.joint_names)) if sum(each[:, j].sum() for each in counts) >= FEWEST]
-    physical, best = space.to_physical(space.start), np.inf
+    joints = _judged(counts)
+    values = {f"{name}/{link}": value for link, own in found.items() for name, value in own.items()}
+    best = np.inf
     for delay in range(views[0].most_delay + 1) if joints else ():
-        solved = [_solved(seen, counts, j, delay) for j in joints]
+        solved = [_solved(*_balance(seen, counts, j, delay), 0.5 * problem.control_dt) for j in joints]
         if (left := sum(part for _, part in solved)) >= best:
             continue
-        best, late = left, float(np.median([values[-1] for values, _ in solved]))
-        found = {f"delay/{GLOBAL}": delay + late / problem.control_dt}
-        for j, (values, part) in zip(joints, solved, strict=True):
+        best, late = left, float(np.median([numbers[-1] for numbers, _ in solved]))
+        of_joints = {f"delay/{GLOBAL}": delay + late / problem.control_dt}
+        for j, (numbers, part) in zip(joints, solved, strict=True):
             if part > _UNEXPLAINED:
                 continue
             # one at its bound is not known: from no friction at all, a descent may not get away
-            known = {name: value for name, value in zip(_FOUND, values, strict=False) if value > 0}
-            found |= {f"{name}/{problem.joint_names[j]}": value for name, value in known.items()}
-    for i, label in enumerate(space.labels if joints else ()):
-        physical[i] = found.get(label, float(physical[i]))
+            known = {name: value for name, value in zip(_FOUND, numbers, strict=False) if value > 0}
+            of_joints |= {f"{name}/{problem.joint_names[j]}": value for name, value in known.items()}
+        values |= of_joints
+    physical = space.to_physical(space.start)
+    for i, label in enumerate(space.labels):
+        physical[i] = values.get(label, float(physical[i]))
     return space.to_normalised(physical).clamp(-1.0, 1.0)
 
 
-def _solved(
+def _judged(counts: Sequence[np.ndarray]) -> list[int]:
+    """The joints that move at enough instants."""
+    return [j for j in range(counts[0].shape[1]) if sum(each[:, j].sum() for each in counts) >= FEWEST]
+
+
+def _balance(
     seen: Sequence[tuple[View, Links]], counts: Sequence[np.ndarray], j: int, delay: int
-) -> tuple[np.ndarray, float]:
-    """Armature, viscous friction, friction, a constant and the delay's rest [s], and the torque left."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """What a joint's own terms multiply, (N, 5), and the torque that they and its links take up, less the links'."""
     tables, torques = [], []
     for (view, links), count in zip(seen, counts, strict=True):
         rows, given = links.rows[count[:, j]], view.smooth_given(j, delay)
@@ -61,7 +92,103 @@ def _solved(
         slope = (given[rows + 1] - given[rows - 1]) / (2 * view.dt)
         tables.append(np.column_stack([*columns, np.ones(len(rows)), slope]))
         torques.append(given[rows] - links.torque[count[:, j], j])
-    table, torque, half = np.concatenate(tables), np.concatenate(torques), 0.5 * seen[0][0].control_dt
+    return np.concatenate(tables), np.concatenate(torques)
+
+
+def _solved(table: np.ndarray, torque: np.ndarray, half: float) -> tuple[np.ndarray, float]:
+    """Armature, viscous friction, friction, a constant and the delay's rest [s], and the torque left."""
     lower, upper = np.array([0.0, 0.0, 0.0, -np.inf, -half]), np.array([np.inf, np.inf, np.inf, np.inf, half])
     values, left = bounded_least_squares(table, torque, lower, upper)
     return values, left / max(float(np.square(torque - torque.mean()).sum()), 1e-300)
+
+
+def _links(views: Sequence[View], references: Sequence[Reference]) -> dict[str, dict[str, float]]:
+    """The free parameters of links that explain most of the torques, {link: {name: value}}; few instants do."""
+    views = [replace(view, coarse=True) for view in views]
+    seen = [(view, Links.of(view)) for view in views]
+    counts = [moving(view, links) for view, links in seen]
+    if not (joints := _judged(counts)):
+        return {}
+    places = [_places(each) for each in references]
+    of_points = [
+        np.stack(
+            [_of_point(view, links, each, u) for each, us in zip(references, places, strict=True) for u in us], axis=-1
+        )
+        for view, links in seen
+    ]
+    best = None
+    for delay in range(views[0].most_delay + 1):
+        parts = []
+        for j in joints:
+            table, torque = _balance(seen, counts, j, delay)
+            columns = np.concatenate([each[count[:, j], j] for each, count in zip(of_points, counts, strict=True)])
+            own, _ = np.linalg.qr(table / np.linalg.norm(table, axis=0).clip(1e-300))
+            rest = np.column_stack([columns, torque]) / max(float(np.linalg.norm(torque - torque.mean())), 1e-300)
+            parts.append(rest - own @ (own.T @ rest))
+        triangle = np.linalg.qr(np.concatenate(parts), mode="r")
+        if best is None or abs(triangle[-1, -1]) < abs(best[-1, -1]):
+            best = triangle
+    return _fitted(best[:, :-1], best[:, -1], references, places)
+
+
+def _fitted(
+    table: np.ndarray, torque: np.ndarray, references: Sequence[Reference], places: Sequence[np.ndarray]
+) -> dict[str, dict[str, float]]:
+    """The parameters whose pseudo-inertias make a torque of those of point masses."""
+    makes = [np.linalg.inv(np.stack([np.outer(u, u)[_UPPER] for u in us], axis=-1)) for us in places]
+    free = [(each, name) for each in references for name in each.names]
+    lower, upper = np.array([each.bounds(name) for each, name in free]).T
+    start, spread = np.array([each.start(name) for each, name in free]), (upper - lower) / 8
+    masses, *_ = np.linalg.lstsq(table, torque, rcond=None)
+    for each, us, own in zip(references, places, np.split(masses, len(references)), strict=True):
+        added = sum(mass * np.outer(u, u) for mass, u in zip(own, us, strict=True))
+        if set(PARTS["load"]) <= set(each.names) and added[3, 3] > 0:
+            load = [added[3, 3], *added[:3, 3] / added[3, 3]]
+            at = [free.index((each, name)) for name in PARTS["load"]]
+            start[at] = np.clip(load, lower[at], upper[at])
+
+    def by_link(values: np.ndarray) -> dict[str, dict[str, float]]:
+        result: dict[str, dict[str, float]] = {each.link: {} for each in references}
+        for (each, name), value in zip(free, values, strict=True):
+            result[each.link][name] = float(value)
+        return result
+
+    def left(values: np.ndarray) -> np.ndarray:
+        own = by_link(values)
+        changes = [_pseudo_inertia(each, own[each.link]) - _pseudo_inertia(each, {}) for each in references]
+        masses = [make @ change[_UPPER] for make, change in zip(makes, changes, strict=True)]
+        return np.concatenate([table @ np.concatenate(masses) - torque, _PRIOR * (values - start) / spread])
+
+    inside = np.clip(start, lower + 1e-3 * spread, upper - 1e-3 * spread)
+    return by_link(least_squares(left, inside, bounds=(lower, upper), x_scale=spread).x)
+
+
+def _places(reference: Reference) -> np.ndarray:
+    """Places of ten point masses around a link, [p, 1], (10, 4)."""
+    com, reach = np.array(reference.values[1:4]), max(reference.values[4:7])
+    return np.column_stack([com + reach * _POINTS, np.ones(len(_POINTS))])
+
+
+def _pseudo_inertia(reference: Reference, values: Mapping[str, float]) -> np.ndarray:
+    """J of a link, (4, 4); of what is not given as in the file."""
+    every = [values.get(name, value) for name, value in zip(NAMES, reference.values, strict=True)]
+    return reference.pseudo_inertia(torch.tensor(every, dtype=torch.float64)).numpy()
+
+
+def _of_point(view: View, links: Links, reference: Reference, u: np.ndarray) -> np.ndarray:
+    """The torque of a point mass of 1 kg on a link, (N, n) [N m]."""
+    body = view.model.body(reference.link).id
+    fields = {name: torch.tensor(getattr(view.model, name)[[body]]) for name in FIELDS}
+    mass = reference.values[0]
+    heavier = pseudo_inertia_of(fields)[0].numpy() + mass * np.outer(u, u)
+    return (Links.of(_with_bodies(view, {reference.link: heavier})).torque - links.torque) / mass
+
+
+def _with_bodies(view: View, bodies: Mapping[str, np.ndarray]) -> View:
+    """A recording's view whose bodies have other pseudo-inertias, (4, 4)."""
+    model = copy.copy(view.model)
+    for link, j in bodies.items():
+        for name, value in fields_of(torch.tensor(j)[None]).items():
+            getattr(model, name)[model.body(link).id] = value[0].numpy()
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return replace(view, model=model)
