@@ -24,6 +24,7 @@ from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.error_bars.undetermined import undetermined
 from pace_optim.estimate.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.export import export
+from pace_optim.identification.balanced_start import balanced_start
 from pace_optim.joints.simulation import reference_path
 from pace_optim.recording import Drive, Load, Recording
 from pace_optim.recording.facts import load_of
@@ -315,6 +316,29 @@ def test_a_wrong_link_is_said_in_words():
     wrong = WrongLink(link="fore", parts=("mass",), values=[value])
     said = "The model file is wrong about the link fore (mass): mass 0.92 ± 0.001 kg instead of 0.8."
     assert (wrong.label, wrong.sentence) == ("fore@mass", said)
+
+
+def test_a_fit_of_a_tool_begins_near_it(tmp_path):
+    """Armatures and frictions took up the tool, and a fit ended in their valley, at 500 times the noise."""
+    tool = Load(added_mass={"tool": 0.5}, added_mass_at={"tool": (0.03, 0.0, -0.08)})
+    recording = dataclasses.replace(recorded(tmp_path, {}, tool, noise=1e-4), load=Load())
+    space = (problem := make_problem(recording, cfg=arm_cfg(tmp_path, ["tool@load"]))).space
+    start = space.to_dict(space.to_physical(balanced_start(problem)))
+    assert start["link_load_mass"]["tool"] == pytest.approx(0.5, rel=0.1)
+    assert start["link_load_x"]["tool"] == pytest.approx(0.03, abs=0.01)
+    assert start["link_load_z"]["tool"] == pytest.approx(-0.08, abs=0.01)
+    assert start["friction"]["shoulder"] == pytest.approx(0.1, rel=0.5)
+
+
+def test_a_fit_of_two_wrong_links_begins_near_them(tmp_path):
+    true = {
+        "upper": reference("upper").inertia({"link_mass": 1.8}),
+        "fore": reference("fore").inertia({"link_com_x": 0.05}),
+    }
+    problem = make_problem(recorded(tmp_path, true, noise=1e-4), cfg=arm_cfg(tmp_path, ["upper@mass", "fore@com"]))
+    start = problem.space.to_dict(problem.space.to_physical(balanced_start(problem)))
+    assert start["link_mass"]["upper"] == pytest.approx(1.8, rel=0.1)
+    assert start["link_com_x"]["fore"] == pytest.approx(0.05, abs=0.01)
 
 
 @pytest.mark.slow
