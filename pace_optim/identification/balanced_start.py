@@ -116,18 +116,21 @@ def _links(views: Sequence[View], references: Sequence[Reference]) -> dict[str, 
         )
         for view, links in seen
     ]
-    best = None
-    for delay in range(views[0].most_delay + 1):
-        parts = []
+
+    def reduced(delay: int) -> np.ndarray:
+        """The triangle R whose last column is the torque that the others' make, own terms of joints projected out."""
+        width = of_points[0].shape[-1] + 1
+        parts = [np.zeros((width, width))]  # so many rows at least
         for j in joints:
             table, torque = _balance(seen, counts, j, delay)
             columns = np.concatenate([each[count[:, j], j] for each, count in zip(of_points, counts, strict=True)])
-            own, _ = np.linalg.qr(table / np.linalg.norm(table, axis=0).clip(1e-300))
+            own = np.linalg.qr(table / np.linalg.norm(table, axis=0).clip(1e-300)).Q
             rest = np.column_stack([columns, torque]) / max(float(np.linalg.norm(torque - torque.mean())), 1e-300)
             parts.append(rest - own @ (own.T @ rest))
-        triangle = np.linalg.qr(np.concatenate(parts), mode="r")
-        if best is None or abs(triangle[-1, -1]) < abs(best[-1, -1]):
-            best = triangle
+        triangle: np.ndarray = np.linalg.qr(np.concatenate(parts), mode="r")
+        return triangle
+
+    best = min(map(reduced, range(views[0].most_delay + 1)), key=lambda triangle: abs(triangle[-1, -1]))
     return _fitted(best[:, :-1], best[:, -1], references, places)
 
 
