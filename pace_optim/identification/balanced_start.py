@@ -127,8 +127,7 @@ def _links(views: Sequence[View], references: Sequence[Reference]) -> dict[str, 
             own = np.linalg.qr(table / np.linalg.norm(table, axis=0).clip(1e-300)).Q
             rest = np.column_stack([columns, torque]) / max(float(np.linalg.norm(torque - torque.mean())), 1e-300)
             parts.append(rest - own @ (own.T @ rest))
-        triangle: np.ndarray = np.linalg.qr(np.concatenate(parts), mode="r")
-        return triangle
+        return np.linalg.qr(np.concatenate(parts)).R
 
     best = min(map(reduced, range(views[0].most_delay + 1)), key=lambda triangle: abs(triangle[-1, -1]))
     return _fitted(best[:, :-1], best[:, -1], references, places)
