@@ -22,6 +22,8 @@ from pace_optim.recording.torque import TorqueChannel
 
 _TURN = 4.0
 """Of a robot that walks, so much time is trained and validated on in turns [s]."""
+_TURN_STARTS = 10
+"""Beginnings of turns that are tried."""
 _SETTLING = 1.0
 """Time after which a wrong speed at the beginning has died out [s]."""
 _LEAST_TORQUE_NOISE = 1e-3
@@ -374,9 +376,8 @@ def make_dataset(
         if r < len(recordings):
             whole = bool(validation) or train_fraction >= 1
             trained = np.arange(recording.num_samples) < validation_start(recording, min(train_fraction, 0.99))
-            if recording.frame is not None:  # what a robot does changes as it walks
-                turns, count = max(1, round(recording.duration / _TURN)), recording.num_samples
-                trained = np.arange(count) * turns / count % 1.0 < train_fraction
+            if recording.frame is not None:
+                trained = _trained_in_turns(recording, train_fraction)
             train[at[torch.from_numpy(trained | whole)], r] = True
         speed, known = start_speed(recording)
         start_vel[r] = torch.as_tensor(speed)
@@ -403,6 +404,22 @@ def make_dataset(
         settling=settling if bool(settling.any()) else None,
         carried=_carried(every, steps),
     )
+
+
+def _trained_in_turns(recording: Recording, fraction: float) -> np.ndarray:
+    """Which samples of a moving base are trained on, (K,) bool: what a robot does changes as it walks.
+
+    Turns begin where the parts of the joints' free times that are held out differ least from what is asked for.
+    """
+    turns, count = max(1, round(recording.duration / _TURN)), recording.num_samples
+    time = np.arange(count) * turns / count
+    ways = [(time + begin) % 1.0 < fraction for begin in np.arange(_TURN_STARTS) / _TURN_STARTS]
+    if recording.free is None:
+        return ways[0]
+    free = recording.free[recording.sample_steps].astype(float)
+    free = free[:, free.any(axis=0)]
+    off = [np.abs(free[trained].sum(axis=0) / free.sum(axis=0) - fraction).max(initial=0.0) for trained in ways]
+    return ways[int(np.argmin(off))]
 
 
 def _carried(recordings: Sequence[Recording], steps: int) -> Carried | None:

@@ -66,13 +66,13 @@ def block_errors(
 def _free_errors(
     error: torch.Tensor, where: torch.Tensor, weight: torch.Tensor, control_dt: float, cfg: FittingCfg
 ) -> BlockErrors:
-    """Errors of joints that are free at times: the free time of each, in so many blocks; 1 where it has none.
+    """Errors of joints that are free at times: the free time of each, in so many blocks. One that has none is not judged: 0.
 
     A leg that hardly swings has one block, which compares nothing: samples of one swing are alike.
     """
     own = [(where & (weight[..., j] > 0)).T.nonzero() for j in range(weight.shape[2])]
     count = cfg.blocks  # for all joints: models are compared block by block
-    square = torch.ones(count, len(own), dtype=torch.float64)
+    square = torch.zeros(count, len(own), dtype=torch.float64)
     for j, places in enumerate(own):
         if len(places):
             r, k = places.T

@@ -129,6 +129,15 @@ def test_blocks_are_seconds_of_the_samples_that_count():
     assert float(blocks.mse[0]) == pytest.approx(1.5)
 
 
+def test_a_joint_that_is_never_free_in_held_out_data_is_not_judged():
+    """It had an error of 1 rad, and effects of other joints explained 0 % of that."""
+    error, where = torch.full((800, 1, 2), 1e-4).double(), torch.ones(800, 1, dtype=torch.bool)
+    weight = torch.ones(800, 1, 2).double() * torch.tensor([1.0, 0.0])
+    errors = block_errors(error * weight, where, 0.0025, weight=weight)
+    assert errors.mse.tolist() == pytest.approx([1e-8, 0.0])
+    assert not judge(errors, errors, 1, 10, first=True).significant
+
+
 @pytest.mark.parametrize(
     ("seconds", "count", "weight"),
     [

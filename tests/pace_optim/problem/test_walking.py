@@ -333,3 +333,18 @@ def test_a_walk_is_trained_and_validated_on_in_turns(duration, turns):
     assert int((data.train[1:, 0] > data.train[:-1, 0]).sum()) == turns - 1
     assert float(data.train.double().mean()) == pytest.approx(0.7, abs=0.01)
     assert bool(data.validation.any()) and not bool((data.validation & data.train).any())
+
+
+def test_of_a_leg_that_seldom_swings_swings_are_held_out():
+    """All of a front leg's swings were trained on, and 1 rad stood for its held-out error."""
+    walk = conform(recording(DT * np.arange(round(12.0 / DT))))
+    free = np.zeros((walk.num_samples, walk.num_joints), dtype=bool)
+    free[:, 1:] = True
+    for begin in (1.0, 5.3, 9.2):  # none in the last 1.2 s of 4 s
+        free[(walk.time > begin) & (walk.time < begin + 0.3), 0] = True
+    frame = np.tile([0, 0, 0, 0, 0, 9.81], (walk.num_samples, 1))
+    walk = replace(walk, frame=frame, frame_point=np.zeros(3), command=walk.dof_pos, free=free)
+    data = make_dataset([walk])
+    part = float(free[data.train[:, 0].numpy(), 0].sum() / free[:, 0].sum())
+    assert float(data.train.double().mean()) == pytest.approx(0.7, abs=0.01)
+    assert 0.5 < part < 0.9
