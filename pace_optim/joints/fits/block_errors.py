@@ -66,9 +66,10 @@ def block_errors(
 def _free_errors(
     error: torch.Tensor, where: torch.Tensor, weight: torch.Tensor, control_dt: float, cfg: FittingCfg
 ) -> BlockErrors:
-    """Errors of joints that are free at times: the free time of each, in so many blocks. One that has none is not judged: 0.
+    """Errors of joints that are free at times: the free time of each, in so many blocks.
 
-    A leg that hardly swings has one block, which compares nothing: samples of one swing are alike.
+    A joint that is never free is not judged: it has 0. A leg that hardly swings has one block,
+    which compares nothing: samples of one swing are alike.
     """
     own = [(where & (weight[..., j] > 0)).T.nonzero() for j in range(weight.shape[2])]
     count = cfg.blocks  # for all joints: models are compared block by block
