@@ -65,6 +65,7 @@ SURE = Evidence(
         ({"at_bound": True}, ["it is at a bound"]),
         ({"implausible": True}, ["no drive has such a value"]),
         ({"left": 8.0, "bars": 0.0, "uneven": 1.0, "at_bound": True}, []),  # it explains everything
+        ({"left": 8.0, "bars": 1.9}, ["its size is not significant"]),
         ({"left": 4.0, "implausible": True}, ["no drive has such a value"]),  # a proxy near the floor
         ({"left": 8.0, "harm": 2.0, "uneven": 1.0}, []),  # what it does to other joints is no doubt about its size
         ({"without": 8.0, "left": 1.0}, []),  # the first one of a joint
@@ -132,7 +133,8 @@ def test_effects_share_what_is_lost_without_them(bench, monkeypatch):
         (5e-3, 1e-2, 50.0, "effect", 0),
         (5e-3, 1e-2, 1.0, "unknown", 1),
         (9e-3, 1e-2, 50.0, "unknown", 1),
-        (2e-4, 1e-2, 1.0, "effect", 0),
+        (2e-4, 1e-2, 0.0, "effect", 0),
+        (2e-4, 1e-2, 1.0, "unknown", 1),
         (1.2e-4, 1.25e-4, 50.0, "nothing_missing", 0),
     ],
 )
@@ -280,6 +282,7 @@ def told_of(outcome, decision, shares, hints=()):
         explained=0.75,
         paying=labels(outcome.final.model, ["servo"], list(shares)),
         shares=shares,
+        named={(effect, 0): SURE for effect in shares if decision == "effect"},
         hints=hints,
     )
 
