@@ -26,7 +26,6 @@ from pace_optim.joints.fits.base_fit import fit_base
 from pace_optim.joints.fits.block_errors import check_long_enough
 from pace_optim.joints.fits.denormals import flushed_denormals
 from pace_optim.joints.fits.fits import Fits, fits_on
-from pace_optim.joints.fits.labels import labels
 from pace_optim.joints.fits.reference_update import ReferenceUpdate
 from pace_optim.problem.problem import Problem
 from pace_optim.run.result import FitResult
@@ -112,11 +111,11 @@ def search_effects(
     named = [(outcome.final.model.effects[row], j) for row, j in kept.nonzero().tolist() if decision == "effect"]
     return Findings(
         outcome=outcome,
+        joint_names=problem.joint_names,
         data=replace(data, sentences=[*data.sentences, *late, *why]),
         absorbed={effect: joints for effect, joints in absorbed.items() if effect not in shares},
         verdict=decision,
         explained=part_explained(outcome, data.floor),
-        paying=labels(outcome.final.model, problem.joint_names, list(shares)) if shares else [],
         shares=shares,
         named={each: names.evidence[each] for each in named},
         hints=names.hints,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -45,13 +45,11 @@ class Findings:
     absorbed: dict[type[Effect], torch.Tensor]
     """Effects that a base parameter absorbs, and on which joints (n,): these recordings would not show them there."""
     verdict: str
+    joint_names: Sequence[str]
     explained: float
     """Part of the error above the floor that the effects found explain."""
-    paying: list[str]
-    """Effects of the final model, as ``fit.py --effects`` takes them, the largest share first: with the verdict
-    ``unknown`` all that lower the error, though they are not what is missing."""
     shares: dict[type[Effect], float]
-    """How much of what they explain is due to each, in the same order."""
+    """How much of what the effects found explain is due to each, the largest first."""
     named: Evidences = field(default_factory=dict)
     """Effects that are what is missing, on each joint with the evidence of that joint."""
     refitted: bool = False
@@ -60,6 +58,14 @@ class Findings:
     """Effects that lower the error of joints and have not earned their names."""
     curves: Curves | None = None
     """Which variable carries what is missing; ``None`` where the effects found leave little."""
+
+    @property
+    def paying(self) -> list[str]:
+        """Effects of the final model, as ``fit.py --effects`` takes them, the largest share first.
+
+        With the verdict ``unknown`` all that lower the error, though they are not what is missing.
+        """
+        return self._labels(self.outcome.final.model, self.shares)
 
     @property
     def free_form(self) -> list[str]:
@@ -86,8 +92,11 @@ class Findings:
     @property
     def added(self) -> list[str]:
         """Those that are what is missing, as ``fit.py --effects`` takes them."""
-        order = list(self.shares_named)
-        return labels(self.model, self.outcome.problem.joint_names, order) if order else []
+        return self._labels(self.model, self.shares_named)
+
+    def _labels(self, model: JointModel, effects: Iterable[type[Effect]]) -> list[str]:
+        order = list(effects)
+        return labels(model, self.joint_names, order) if order else []
 
 
 def told(
@@ -148,7 +157,7 @@ def with_refit(
         folder: Of the refit.
     """
     names, paths = problem.joint_names, [diagnosis.run, str(folder)]
-    found = as_refitted(found, names, run, refit)
+    found = as_refitted(found, run, refit)
     before, after = (each.rmse["validation"][ALL] for each in (run, refit))
     judged = _judged(found, wrong, problem)
     fall = (
@@ -166,10 +175,11 @@ def with_refit(
     )
 
 
-def as_refitted(found: Findings, joint_names: Sequence[str], run: FitResult, refit: FitResult) -> Findings:
+def as_refitted(found: Findings, run: FitResult, refit: FitResult) -> Findings:
     """What stands once the whole robot is fitted with it: the same rules, with that fit's errors and sizes."""
-    outcome, floor = on_whole_robot(found.outcome, joint_names, run, refit), found.data.floor
-    outcome, named, hints = judged_again(outcome, found.named, joint_names, refit)
+    floor, names = found.data.floor, found.joint_names
+    outcome = on_whole_robot(found.outcome, names, run, refit)
+    outcome, named, hints = judged_again(outcome, found.named, names, refit)
     joints = torch.zeros(len(floor), dtype=torch.bool)
     joints[sorted({j for _, j in named})] = True
     return replace(

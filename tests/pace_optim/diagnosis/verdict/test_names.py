@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from diagnoses import FakeFits, errors_of, hidden_run, joint_alone, with_effects
+from diagnoses import FakeFits, errors_of, hidden_run, joint_alone, make_evidence, with_effects
 from problems import CALM
 
 from pace_actuators.effects import get_effect
@@ -18,7 +18,7 @@ from pace_optim.diagnosis.checks.stated_facts import excluded_effects
 from pace_optim.diagnosis.findings import findings
 from pace_optim.diagnosis.findings.findings import Findings, summary_of
 from pace_optim.diagnosis.search.state import Outcome
-from pace_optim.diagnosis.selection.naming import Evidence, doubts
+from pace_optim.diagnosis.selection.naming import doubts
 from pace_optim.diagnosis.selection.size_consistency import unevenness
 from pace_optim.diagnosis.verdict import names as names_module
 from pace_optim.diagnosis.verdict.names import Hint, earned_names, shares_of
@@ -33,18 +33,7 @@ from pace_optim.report import write_report
 SPRING, QUADRATIC, STRIBECK = (get_effect(n) for n in ("parallel_spring", "quadratic_friction", "stribeck_friction"))
 CREEP, SKEW = get_effect("creeping_friction"), get_effect("clock_skew")
 FLOOR, YES = torch.tensor([1e-4]).double(), torch.tensor([True])
-SURE = Evidence(
-    without=100.0,
-    left=20.0,
-    floor=1.0,
-    harm=0.0,
-    larger=0.0,
-    slight=False,
-    bars=50.0,
-    uneven=0.0,
-    at_bound=False,
-    implausible=False,
-)
+SURE = make_evidence(100.0, 20.0, 1.0)
 """In units of the squared floor: far from it with the effect too."""
 
 
@@ -280,7 +269,7 @@ def told_of(outcome, decision, shares, hints=()):
         absorbed={},
         verdict=decision,
         explained=0.75,
-        paying=labels(outcome.final.model, ["servo"], list(shares)),
+        joint_names=["servo"],
         shares=shares,
         named={(effect, 0): SURE for effect in shares if decision == "effect"},
         hints=hints,

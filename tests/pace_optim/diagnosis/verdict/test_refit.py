@@ -4,32 +4,19 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from diagnoses import errors_of, joint_alone, make_diagnosis, with_effects
+from diagnoses import errors_of, joint_alone, make_diagnosis, make_evidence, with_effects
 
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis import Diagnosis
 from pace_optim.diagnosis.checks.data_check import DataCheck
 from pace_optim.diagnosis.findings.findings import Findings, as_refitted, with_refit
 from pace_optim.diagnosis.search.state import Outcome
-from pace_optim.diagnosis.selection.naming import Evidence
 from pace_optim.diagnosis.wrong_links import LinkFindings
-from pace_optim.joints.fits.labels import labels
 from pace_optim.joints.fits.model import JointModel
 
 QUADRATIC, BACKLASH = get_effect("quadratic_friction"), get_effect("backlash")
 FLOOR = torch.tensor([1e-4]).double()
-ALONE = Evidence(
-    without=1e-4,
-    left=1e-8,
-    floor=1e-8,
-    harm=0.0,
-    larger=0.0,
-    slight=False,
-    bars=50.0,
-    uneven=0.0,
-    at_bound=False,
-    implausible=False,
-)
+ALONE = make_evidence(1e-4, 1e-8, 1e-8)
 """Of the joint alone: from 10 mrad to the floor of 0.1."""
 
 
@@ -52,7 +39,7 @@ def found_on_joints(*effects):
         absorbed={},
         verdict="effect",
         explained=1.0,
-        paying=labels(final.model, ["servo"], list(shares)),
+        joint_names=["servo"],
         shares=shares,
         named={(effect, 0): ALONE for effect, _ in effects},
     )
@@ -89,14 +76,14 @@ def fit_of(rmse, value=None, std=None, at_bound=(), effect="quadratic_friction.c
     ],
 )
 def test_the_whole_robot_s_fit_is_judged_by_the_rule_of_joints_alone(before, refit, doubt):
-    found = as_refitted(found_on_joints((QUADRATIC, [0.2])), ["servo"], fit_of(before), refit)
+    found = as_refitted(found_on_joints((QUADRATIC, [0.2])), fit_of(before), refit)
     assert found.verdict == ("effect" if doubt is None else "unknown")
     assert found.added == ([] if doubt else ["quadratic_friction"]) and found.paying == ["quadratic_friction"]
     assert [each.doubts for each in found.hints] == ([] if doubt is None else [[doubt]])
 
 
 def test_a_robot_that_is_complete_without_the_effect_lacks_nothing():
-    found = as_refitted(found_on_joints((QUADRATIC, [0.2])), ["servo"], fit_of(1.2e-4), fit_of(1.1e-4, 0.001, 0.01))
+    found = as_refitted(found_on_joints((QUADRATIC, [0.2])), fit_of(1.2e-4), fit_of(1.1e-4, 0.001, 0.01))
     assert found.verdict == "nothing_missing" and found.hints == [] and found.added == []
 
 
@@ -105,7 +92,7 @@ def test_of_two_effects_only_the_one_that_the_fit_refutes_loses_its_name():
     refit = fit_of(1e-4, 0.2, 0.01)
     gap = f"backlash.{BACKLASH.parameters[0].name}"
     refit.parameters[gap], refit.std[gap] = {"servo": 1e-3}, {"servo": 1e-3}
-    found = as_refitted(found, ["servo"], fit_of(1e-2), refit)
+    found = as_refitted(found, fit_of(1e-2), refit)
     assert found.verdict == "effect" and found.added == ["quadratic_friction"]
     assert [(each.effect, each.doubts) for each in found.hints] == [("backlash", ["its size is not significant"])]
 
