@@ -24,7 +24,7 @@ from pace_optim.diagnosis.verdict.free_curves import Curves, error_map
 from pace_optim.diagnosis.verdict.names import Hint, new_effects
 from pace_optim.diagnosis.verdict.refit import Evidences, judged_again, on_whole_robot
 from pace_optim.diagnosis.verdict.sizes import factor_of, sizes, without_error_bars
-from pace_optim.diagnosis.verdict.verdict import likes, part_explained, ranking, verdict
+from pace_optim.diagnosis.verdict.verdict import likes, part_explained, ranking, restricted, verdict
 from pace_optim.diagnosis.wrong_links import LinkFindings
 from pace_optim.joints.fits.fits import Fits
 from pace_optim.joints.fits.labels import labels
@@ -179,15 +179,18 @@ def as_refitted(found: Findings, run: FitResult, refit: FitResult) -> Findings:
     """What stands once the whole robot is fitted with it: the same rules, with that fit's errors and sizes."""
     floor, names = found.data.floor, found.joint_names
     outcome = on_whole_robot(found.outcome, names, run, refit)
-    outcome, named, hints = judged_again(outcome, found.named, names, refit)
-    joints = torch.zeros(len(floor), dtype=torch.bool)
-    joints[sorted({j for _, j in named})] = True
+    named, hints = judged_again(outcome, floor, found.named, names, refit)
+    with_name, with_hint, before = (
+        torch.tensor([j in joints for j in range(len(names))])
+        for joints in ({j for _, j in named}, {each.joint for each in hints}, {j for _, j in found.named})
+    )
+    needs_none = before & ~with_name & ~with_hint
     return replace(
         found,
         outcome=outcome,
         named=named,
         hints=[*found.hints, *hints],
-        verdict=verdict(outcome, floor, joints)[0],
+        verdict=verdict(restricted(outcome, ~needs_none), floor, with_name)[0],
         explained=part_explained(outcome, floor),
         refitted=True,
     )

@@ -30,16 +30,17 @@ def on_whole_robot(outcome: Outcome, joint_names: Sequence[str], run: FitResult,
 
 
 def judged_again(
-    outcome: Outcome, named: Evidences, joint_names: Sequence[str], refit: FitResult
-) -> tuple[Outcome, Evidences, list[Hint]]:
+    outcome: Outcome, floor: torch.Tensor, named: Evidences, joint_names: Sequence[str], refit: FitResult
+) -> tuple[Evidences, list[Hint]]:
     """The names that the whole robot's fit leaves, by the rule that they were earned by; others become hints.
 
     Errors, sizes and their error bars are those of that fit. Without an effect, the joint alone or the run stands,
-    whichever leaves less. A fit far above the noise has no error bars; those of the joint alone stand then. As before
-    that fit, a joint that ends without a name and is near the floor without effects is given none.
+    whichever leaves less. A fit far above the noise has no error bars; those of the joint alone stand then. A joint
+    that is near the floor in the run needs no hint.
 
     Args:
         outcome: With the whole robot's errors and values.
+        floor: Of each joint, (n,) [rad].
         named: Effects that are named, with the evidence of each joint alone.
         joint_names: The joints.
         refit: The whole robot's fit.
@@ -47,7 +48,7 @@ def judged_again(
     now, before, after = outcome.final, outcome.base_errors.mse, outcome.final_errors.mse
     bars = error_bars_from_none(now, _entries(outcome, joint_names, refit.std, torch.zeros_like(now.physical)))
     stuck, implausible = now.model.has_at_bounds(now.x, now.moves), now.model.implausible(now.physical)
-    harm = harm_of(outcome)
+    harm, far = harm_of(outcome), before.sqrt() > outcome.cfg.judging.far * floor
     stand: dict[tuple[type[Effect], int], Evidence] = {}
     hints: list[Hint] = []
     for row, effect in enumerate(now.model.effects):
@@ -66,21 +67,11 @@ def judged_again(
         }
         for j in evidence:
             told = hint(effect, j, evidence, outcome)
-            if told.doubts:
-                hints.append(told)
-            else:
+            if not told.doubts:
                 stand[effect, j] = evidence[j]
-    names = {j for _, j in stand}
-    floors = {j: own.floor for (_, j), own in named.items()}
-    far = outcome.cfg.judging.far**2
-    dropped = [j for j, floor in floors.items() if j not in names and float(before[j]) <= far * floor]
-    for j in dropped:
-        here = torch.arange(len(before)) == j
-        now = now.with_joints(here, outcome.base)
-        after = torch.where(here, before, after)
-    errors = replace(outcome.final_errors, square=after[None])
-    left = replace(outcome, final=now, final_errors=errors)
-    return left, stand, [each for each in hints if each.joint not in dropped]
+            elif bool(far[j]):
+                hints.append(told)
+    return stand, hints
 
 
 def _errors(result: FitResult, joint_names: Sequence[str]) -> BlockErrors:
