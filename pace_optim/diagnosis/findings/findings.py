@@ -149,7 +149,7 @@ def with_refit(
 
     Args:
         diagnosis: Of joints that are simulated alone.
-        found: What it tells.
+        found: What the search found, on those joints.
         wrong: Links that the model file states wrongly.
         problem: The whole robot.
         run: What was diagnosed.

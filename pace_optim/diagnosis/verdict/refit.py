@@ -34,8 +34,8 @@ def judged_again(
 ) -> tuple[Evidences, list[Hint]]:
     """The names that the whole robot's fit leaves, by the rule that they were earned by; others become hints.
 
-    Errors, sizes and their error bars are those of that fit. Without an effect, the joint alone or the run stands,
-    whichever leaves less. A fit far above the noise has no error bars; those of the joint alone stand then. A joint
+    Errors, sizes and their error bars are those of that fit. The error without an effect is the lower one of the joint
+    alone and the run. A fit far above the noise has no error bars; those of the joint alone stand then. A joint
     that is near the floor in the run needs no hint.
 
     Args:

@@ -125,7 +125,7 @@ def error_bars_from_none(now: Fitted, std: torch.Tensor | None = None) -> torch.
 
     Args:
         now: A model, fitted.
-        std: Physical standard deviations, (n, P), zero where there is none; ``None``: from its Jacobian.
+        std: Physical standard deviations, (n, P), zero without error bar; ``None``: from its Jacobian.
     """
     std, physical = standard_deviations(now) if std is None else std, now.physical
     result = torch.zeros(now.model.has.shape, dtype=torch.float64)
