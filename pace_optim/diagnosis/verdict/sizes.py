@@ -35,8 +35,9 @@ def sizes(fits: Fits, outcome: Outcome, floor: torch.Tensor, joint_names: tuple[
     found = now.model.has & torch.tensor([not effect.free_form for effect in now.model.effects]).bool()[:, None]
     if not bool(found.any()):
         return []
-    if now.jacobian is None or now.error is None or now.model.shared:  # a common value was held while it was fitted
+    if now.model.shared:  # a common value was held while it was fitted
         now = fits.looked_at(outcome.problem, [now])[0]
+    now = fits.looked_closely(outcome.problem, now)
     std, stuck = standard_deviations(now), now.model.at_bounds(now.x, now.moves)
     std = torch.where(std > 0, torch.hypot(std, _step_shares(fits, outcome.problem, now)), std)
     unsure = without_error_bars(outcome, floor).tolist()
