@@ -412,7 +412,7 @@ class Fits:
             going = [way for way in running if not way.finished]
             if not going:
                 break
-            if len(going) < cfg.thinned * len(running):
+            if len(going) <= len(running) / 2:  # changes time alone
                 running, batch = going, self._batch_of(problem, going)
         if chords:
             batch = self.batch(problem, [Slot(model=way.model, rows=1) for way in ways], training=True)
