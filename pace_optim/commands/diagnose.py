@@ -57,7 +57,7 @@ def main() -> None:
 
 
 def run_and_tell(settings: DiagnosisSettings) -> None:
-    """Diagnose; print the verdict before the robot is fitted again, then the sizes, that fit and its folder."""
+    """Diagnose; print the verdict before the robot is fitted again, then the sizes, that fit with its verdict."""
     diagnosis = diagnose(settings, on_verdict=lambda found: print(*lines_of(found), sep="\n", flush=True))
     first, last = Path(diagnosis.runs[0]), Path(diagnosis.runs[-1])
     lines = size_lines(diagnosis.sizes)
@@ -65,5 +65,6 @@ def run_and_tell(settings: DiagnosisSettings) -> None:
         with_what = [*(link["link"] for link in diagnosis.links), *diagnosis.paying]
         before, refit = FitResult.load(first), FitResult.load(last)
         lines = ["", f"whole robot with {' and '.join(with_what)}:", *summary(refit)]
-        lines += [error_line(before, "error before, all joints"), *next_line(refit, last)]
+        lines += [error_line(before, "error before, all joints"), f"verdict: {diagnosis.verdict}", diagnosis.summary]
+        lines += next_line(refit, last)
     print(*lines, f"report: {last / 'report.html'}", f"run: {last}", sep="\n")

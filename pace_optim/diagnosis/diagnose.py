@@ -11,7 +11,7 @@ from pathlib import Path
 from pace_actuators.effects import EffectCfg
 from pace_actuators.files import json_text, write_together
 from pace_optim.diagnosis.candidates.library import candidate_effects
-from pace_optim.diagnosis.findings.findings import Findings, told, with_links, with_refit
+from pace_optim.diagnosis.findings.findings import Findings, told, with_refit
 from pace_optim.diagnosis.findings.result import FILE, Diagnosis
 from pace_optim.diagnosis.method import search_effects
 from pace_optim.diagnosis.selection.decisions import FILE as DECISIONS
@@ -80,7 +80,7 @@ def diagnose(
         cfg=settings.cfg,
         fits=fits,
     )
-    diagnosis = with_links(told(found, fits, problem, result, folder, candidates), wrong, problem)
+    diagnosis = told(found, fits, wrong, problem, result, folder, candidates)
     diagnosis = replace(diagnosis, wall_time_s=time.monotonic() - begin)
     _save(diagnosis, decisions)
     progress.close()
@@ -90,7 +90,7 @@ def diagnose(
     refit = refit or (bool(wrong.wrong) and settings.refit is None)
     pays = bool(found.paying or wrong.wrong)
     if refit and pays and (path := _refit(found, wrong, problem, run, diagnosis, progress)) is not None:
-        diagnosis = with_refit(diagnosis, result, FitResult.load(path), path)
+        diagnosis = with_refit(diagnosis, found, wrong, problem, result, FitResult.load(path), path)
         diagnosis = replace(diagnosis, wall_time_s=time.monotonic() - begin)
         _save(diagnosis, decisions)
     return diagnosis

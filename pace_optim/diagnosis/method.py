@@ -20,13 +20,12 @@ from pace_optim.diagnosis.search.search import add_effects
 from pace_optim.diagnosis.search.state import Search
 from pace_optim.diagnosis.selection.decisions import Log, unlogged
 from pace_optim.diagnosis.verdict.free_curves import fit_curves, take_curves
-from pace_optim.diagnosis.verdict.names import earned_names, shares_of
+from pace_optim.diagnosis.verdict.names import earned_names, new_effects, shares_of
 from pace_optim.diagnosis.verdict.verdict import part_explained, verdict
 from pace_optim.joints.fits.base_fit import fit_base
 from pace_optim.joints.fits.block_errors import check_long_enough
 from pace_optim.joints.fits.denormals import flushed_denormals
 from pace_optim.joints.fits.fits import Fits, fits_on
-from pace_optim.joints.fits.labels import labels
 from pace_optim.joints.fits.reference_update import ReferenceUpdate
 from pace_optim.problem.problem import Problem
 from pace_optim.run.result import FitResult
@@ -108,14 +107,17 @@ def search_effects(
     curves = fit_curves(fits, outcome, data.floor, names.named, say, log)
     decision, outcome = verdict(take_curves(outcome, curves), data.floor, names.named)
     shares = shares_of(names, outcome)
+    kept = new_effects(outcome, outcome.final.model)
+    named = [(outcome.final.model.effects[row], j) for row, j in kept.nonzero().tolist() if decision == "effect"]
     return Findings(
         outcome=outcome,
+        joint_names=problem.joint_names,
         data=replace(data, sentences=[*data.sentences, *late, *why]),
         absorbed={effect: joints for effect, joints in absorbed.items() if effect not in shares},
         verdict=decision,
         explained=part_explained(outcome, data.floor),
-        paying=labels(outcome.final.model, problem.joint_names, list(shares)) if shares else [],
         shares=shares,
+        named={each: names.evidence[each] for each in named},
         hints=names.hints,
         curves=curves,
     )

@@ -19,6 +19,7 @@ from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg
 from pace_optim.diagnosis.search.one_round import try_effects
 from pace_optim.diagnosis.search.state import Outcome, Search
 from pace_optim.diagnosis.selection.candidate_results import Trial
+from pace_optim.diagnosis.selection.naming import Evidence
 from pace_optim.joints.fits.block_errors import BlockErrors
 from pace_optim.joints.fits.fits import Fits, fits_on
 from pace_optim.joints.fits.fitted import Fitted
@@ -96,6 +97,12 @@ def make_diagnosis(verdict: str = "effect") -> dict[str, Any]:
         "error_map": dict.fromkeys(JOINTS if verdict == "unknown" else (), carried),
         "wall_time_s": 12.0,
     }
+
+
+def make_evidence(without: float, left: float, floor: float) -> Evidence:
+    """Of an effect alone on its joint whose size is sure; squared errors."""
+    sure = {"harm": 0.0, "larger": 0.0, "slight": False, "bars": 50.0, "uneven": 0.0}
+    return Evidence(without=without, left=left, floor=floor, at_bound=False, implausible=False, **sure)
 
 
 def make_trial(effect: type[Effect], joint: int, after: float, significant: bool = True) -> Trial:

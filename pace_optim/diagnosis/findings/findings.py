@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +17,18 @@ from pace_actuators.files import json_text
 from pace_actuators.joint_units import units_for
 from pace_actuators.text import conjoined
 from pace_optim.diagnosis.checks.data_check import DataCheck
-from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.diagnosis.findings.advice import advise
 from pace_optim.diagnosis.findings.result import Diagnosis
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.verdict.free_curves import Curves, error_map
-from pace_optim.diagnosis.verdict.names import Hint
-from pace_optim.diagnosis.verdict.sizes import factor_of, sizes
-from pace_optim.diagnosis.verdict.verdict import likes, ranking
+from pace_optim.diagnosis.verdict.names import Hint, new_effects
+from pace_optim.diagnosis.verdict.refit import Evidences, judged_again, on_whole_robot
+from pace_optim.diagnosis.verdict.sizes import factor_of, sizes, without_error_bars
+from pace_optim.diagnosis.verdict.verdict import likes, part_explained, ranking, restricted, verdict
 from pace_optim.diagnosis.wrong_links import LinkFindings
 from pace_optim.joints.fits.fits import Fits
+from pace_optim.joints.fits.labels import labels
+from pace_optim.joints.fits.model import JointModel
 from pace_optim.problem.problem import Problem
 from pace_optim.run.result import FitResult
 
@@ -36,24 +38,34 @@ _LEAST_TOLD = 0.1
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Findings:
-    """What the search on the twins found."""
+    """What the search on the twins found, or what stands of it once the whole robot is fitted."""
 
     outcome: Outcome
     data: DataCheck
     absorbed: dict[type[Effect], torch.Tensor]
     """Effects that a base parameter absorbs, and on which joints (n,): these recordings would not show them there."""
     verdict: str
+    joint_names: Sequence[str]
     explained: float
     """Part of the error above the floor that the effects found explain."""
-    paying: list[str]
-    """Effects of the final model, as ``fit.py --effects`` takes them, the largest share first: with the verdict
-    ``unknown`` all that lower the error, though they are not what is missing."""
     shares: dict[type[Effect], float]
-    """How much of what they explain is due to each, in the same order."""
+    """How much of what the effects found explain is due to each, the largest first."""
+    named: Evidences = field(default_factory=dict)
+    """Effects that are what is missing, on each joint with the evidence of that joint."""
+    refitted: bool = False
+    """Whether errors and sizes are those of the whole robot's fit."""
     hints: Sequence[Hint] = ()
     """Effects that lower the error of joints and have not earned their names."""
     curves: Curves | None = None
     """Which variable carries what is missing; ``None`` where the effects found leave little."""
+
+    @property
+    def paying(self) -> list[str]:
+        """Effects of the final model, as ``fit.py --effects`` takes them, the largest share first.
+
+        With the verdict ``unknown`` all that lower the error, though they are not what is missing.
+        """
+        return self._labels(self.outcome.final.model, self.shares)
 
     @property
     def free_form(self) -> list[str]:
@@ -62,44 +74,57 @@ class Findings:
         return [label for label in self.paying if label.partition("@")[0] in names]
 
     @property
+    def model(self) -> JointModel:
+        """The final model; where effects are named, without the others that were found."""
+        model, others = self.outcome.final.model, new_effects(self.outcome, self.outcome.final.model)
+        if not self.named:
+            return model
+        for effect, j in self.named:
+            others[model.effects.index(effect), j] = False
+        return replace(model, has=model.has & ~others)
+
+    @property
+    def shares_named(self) -> dict[type[Effect], float]:
+        """The shares of those that are what is missing."""
+        named = {effect for effect, _ in self.named}
+        return {effect: share for effect, share in self.shares.items() if effect in named}
+
+    @property
     def added(self) -> list[str]:
-        """Those that are what is missing."""
-        return [label for label in self.paying if label not in self.free_form] if self.verdict == "effect" else []
+        """Those that are what is missing, as ``fit.py --effects`` takes them."""
+        return self._labels(self.model, self.shares_named)
+
+    def _labels(self, model: JointModel, effects: Iterable[type[Effect]]) -> list[str]:
+        order = list(effects)
+        return labels(model, self.joint_names, order) if order else []
 
 
 def told(
     found: Findings,
     fits: Fits,
+    wrong: LinkFindings,
     problem: Problem,
     run: FitResult,
     folder: Path,
     candidates: Sequence[type[Effect]],
 ) -> Diagnosis:
-    """What was found, as ``diagnosis.json`` has it."""
+    """What was found, as ``diagnosis.json`` has it; effects were sought beside links that the file states wrongly."""
     cfg = found.outcome.cfg
     return Diagnosis(
         run=str(folder),
-        verdict=found.verdict,
-        summary=summary_of(found, problem),
-        explained=found.explained,
-        added=found.added,
+        **_judged(found, wrong, problem),
+        links=[asdict(each) | {"label": each.label} for each in wrong.wrong],
         paying=found.paying,
         shares={effect.name: share for effect, share in found.shares.items()},
         free_form=found.free_form,
-        ranking=ranking(
-            found.outcome, problem.joint_names, found.verdict, list(found.shares), joint_types=problem.joint_types
-        ),
-        hints=[asdict(hint) | {"joint": problem.joint_names[hint.joint]} for hint in found.hints],
         sizes=sizes(fits, found.outcome, found.data.floor, problem.joint_names),
         likes=likes(found.outcome),
-        joints=by_joint(found, problem),
-        data=[*found.data.sentences, *_about_run(found, problem, run)],
+        data=[*_about_links(wrong, problem), *found.data.sentences, *_about_run(found, problem, run)],
         absorbed={effect.name: effect.absorbed_by for effect in found.absorbed},
         advice=advise(problem, found.outcome, found.verdict, found.data, found.absorbed),
         runs=[str(folder)],
         tried=[effect.name for effect in candidates],
         physics_dt=problem.physics_dt,
-        ladder=ladder(found),
         error_map=error_map(
             found.curves,
             problem.joint_names,
@@ -111,56 +136,98 @@ def told(
     )
 
 
-def with_links(diagnosis: Diagnosis, wrong: LinkFindings, problem: Problem) -> Diagnosis:
-    """The same with the links that the model file states wrongly; effects were then sought beside them."""
-    if not wrong.wrong:
-        return replace(diagnosis, data=[*wrong.sentences, *diagnosis.data])
-    unit = units_for("mrad", problem.joint_types)
-    said = [each.sentence for each in wrong.wrong]
-    fall = (
-        f"With {conjoined(each.label for each in wrong.wrong)} the validation error falls from "
-        f"{1e3 * wrong.before:.3g} to {1e3 * wrong.after:.3g} {unit} at the diagnosis' physics step."
-    )
-    rest = [] if diagnosis.verdict == "nothing_missing" else [diagnosis.summary]
-    return replace(
-        diagnosis,
-        verdict="link" if diagnosis.verdict == "nothing_missing" else diagnosis.verdict,
-        summary=" ".join([*said, *rest]),
-        data=[fall, *diagnosis.data],
-        links=[asdict(each) | {"label": each.label} for each in wrong.wrong],
-    )
-
-
-def with_refit(diagnosis: Diagnosis, run: FitResult, refit: FitResult, folder: Path) -> Diagnosis:
-    """The same with the whole robot's errors, before and with what was found.
+def with_refit(
+    diagnosis: Diagnosis,
+    found: Findings,
+    wrong: LinkFindings,
+    problem: Problem,
+    run: FitResult,
+    refit: FitResult,
+    folder: Path,
+) -> Diagnosis:
+    """The same, judged again by the whole robot's fit with what was found.
 
     Args:
-        diagnosis: Of the run.
+        diagnosis: Of joints that are simulated alone.
+        found: What the search found, on those joints.
+        wrong: Links that the model file states wrongly.
+        problem: The whole robot.
         run: What was diagnosed.
         refit: The whole robot with what was found.
         folder: Of the refit.
     """
-    names = [*(link["link"] for link in diagnosis.links), *diagnosis.paying]
+    names, paths = problem.joint_names, [diagnosis.run, str(folder)]
+    found = as_refitted(found, run, refit)
     before, after = (each.rmse["validation"][ALL] for each in (run, refit))
-    unit = units_for("mrad", run.joint_types)
-    floors = {joint: own.get("floor", math.inf) for joint, own in diagnosis.joints.items()}
-    alike, left = DEFAULT.judging.alike, refit.rmse["validation"]
-    above = {joint for joint, floor in floors.items() if left.get(joint, 0.0) > alike * floor}
-    fall = f"With it the whole robot's validation error falls from {1e3 * before:.3g} to {1e3 * after:.3g} {unit}."
+    judged = _judged(found, wrong, problem)
+    fall = (
+        f"With {conjoined([*(each.link for each in wrong.wrong), *found.paying])} the whole robot's validation error "
+        f"falls from {1e3 * before:.3g} to {1e3 * after:.3g} {units_for('mrad', run.joint_types)}."
+    )
+    steps = zip(judged["ladder"], (before, after), paths, strict=True)
+    ladder_of_runs = [step | {"validation_rmse": rmse, "run": path} for step, rmse, path in steps]
+    unsure = without_error_bars(found.outcome, found.data.floor).tolist()
     return replace(
         diagnosis,
-        summary=f"{diagnosis.summary} {fall}",
-        sizes=[_as_refitted(size, refit, above) for size in diagnosis.sizes],
-        runs=[diagnosis.run, str(folder)],
-        ladder=[
-            {"model": "base model", "validation_rmse": before, "run": diagnosis.run},
-            {"model": " + ".join(names), "validation_rmse": after, "run": str(folder)},
-        ],
+        **judged | {"summary": f"{judged['summary']} {fall}", "ladder": ladder_of_runs},
+        sizes=[_as_refitted(size, refit, unsure[names.index(size["joint"])]) for size in diagnosis.sizes],
+        runs=paths,
     )
 
 
-def _as_refitted(size: dict[str, Any], refit: FitResult, above: Collection[str]) -> dict[str, Any]:
-    """The size of an effect as the refit of the whole robot has it; stiff and ``above`` the floor: no error bar."""
+def as_refitted(found: Findings, run: FitResult, refit: FitResult) -> Findings:
+    """What stands once the whole robot is fitted with it: the same rules, with that fit's errors and sizes."""
+    floor, names = found.data.floor, found.joint_names
+    outcome = on_whole_robot(found.outcome, names, run, refit)
+    named, hints = judged_again(outcome, floor, found.named, names, refit)
+    with_name, with_hint, before = (
+        torch.tensor([j in joints for j in range(len(names))])
+        for joints in ({j for _, j in named}, {each.joint for each in hints}, {j for _, j in found.named})
+    )
+    needs_none = before & ~with_name & ~with_hint
+    return replace(
+        found,
+        outcome=outcome,
+        named=named,
+        hints=[*found.hints, *hints],
+        verdict=verdict(restricted(outcome, ~needs_none), floor, with_name)[0],
+        explained=part_explained(outcome, floor),
+        refitted=True,
+    )
+
+
+def _judged(found: Findings, wrong: LinkFindings, problem: Problem) -> dict[str, Any]:
+    """The fields of a diagnosis that its last fit decides."""
+    only_links = bool(wrong.wrong) and found.verdict == "nothing_missing"
+    said = [each.sentence for each in wrong.wrong]
+    outcome = replace(found.outcome, final=replace(found.outcome.final, model=found.model))
+    return {
+        "verdict": "link" if only_links else found.verdict,
+        "summary": " ".join([*said, *([] if only_links else [summary_of(found, problem)])]),
+        "explained": found.explained,
+        "added": found.added,
+        "hints": [asdict(hint) | {"joint": problem.joint_names[hint.joint]} for hint in found.hints],
+        "joints": by_joint(found, problem),
+        "ladder": ladder(found, wrong),
+        "ranking": ranking(
+            outcome, problem.joint_names, found.verdict, list(found.shares), joint_types=problem.joint_types
+        ),
+    }
+
+
+def _about_links(wrong: LinkFindings, problem: Problem) -> list[str]:
+    """By how much the error falls with the links that the model file states wrongly."""
+    if not wrong.wrong:
+        return wrong.sentences
+    return [
+        f"With {conjoined(each.label for each in wrong.wrong)} the validation error falls from "
+        f"{1e3 * wrong.before:.3g} to {1e3 * wrong.after:.3g} {units_for('mrad', problem.joint_types)} at the "
+        "diagnosis' physics step."
+    ]
+
+
+def _as_refitted(size: dict[str, Any], refit: FitResult, unsure: bool) -> dict[str, Any]:
+    """The size of an effect as the refit of the whole robot has it; where that is ``unsure`` without error bar."""
     name, joint = f"{size['effect']}.{size['parameter']}", size["joint"]
     values = refit.parameters.get(name, {})
     if (key := joint if joint in values else ALL) not in values:
@@ -169,7 +236,7 @@ def _as_refitted(size: dict[str, Any], refit: FitResult, above: Collection[str])
     (parameter,) = (each for each in effect.parameters if each.name == size["parameter"])
     return size | {
         "value": values[key],
-        "std": None if refit.std_means_nothing or (effect.is_stiff and joint in above) else refit.std[name][key],
+        "std": None if refit.std_means_nothing or unsure else refit.std[name][key],
         "factor": None if size["factor"] is None else factor_of(effect, parameter, values[key]),
         "at_bound": f"{name}/{key}" in refit.at_bound,
     }
@@ -199,8 +266,7 @@ def summary_of(found: Findings, problem: Problem) -> str:
     """The verdict in a few sentences."""
     unit = units_for("mrad", problem.joint_types)
     before = 1e3 * float(found.outcome.base_errors.mse.mean().sqrt())
-    after = 1e3 * float(found.outcome.final_errors.mse.mean().sqrt())
-    alone = "" if len(problem.joint_names) == 1 else ", with each joint simulated alone"
+    alone = "" if len(problem.joint_names) == 1 or found.refitted else ", with each joint simulated alone"
     floor = 1e3 * float(found.data.floor.square().mean().sqrt())
     if found.verdict == "nothing_missing":
         return (
@@ -222,8 +288,10 @@ def summary_of(found: Findings, problem: Problem) -> str:
         f"{_missing(found)} On held-out recordings {what} explains {100 * found.explained:.0f} % of what lies above "
         f"the floor ({floor:.3g} {unit})."
     )
-    if after > found.outcome.cfg.judging.far * floor and not found.free_form:
-        summary += " Something else is missing too, which no known effect explains."
+    far = found.outcome.far(found.data.floor).tolist()
+    if any(far) and not found.free_form:
+        where = conjoined(name for name, is_far in zip(problem.joint_names, far, strict=True) if is_far)
+        summary += f" Something else is missing on {where} too, which no known effect explains."
     return " ".join([summary, *hint_sentences(found.hints, problem.joint_names)])
 
 
@@ -244,8 +312,9 @@ def _missing(found: Findings) -> str:
         )
     if len(found.added) < 2:
         return f"Missing: {found.added[0]}."
-    parts = [f"{label} ({percent_text(s)} %)" for label, s in zip(found.added, found.shares.values(), strict=True)]
-    if max(found.shares.values()) >= found.outcome.cfg.verdict.most:
+    shares = found.shares_named.values()
+    parts = [f"{label} ({percent_text(s)} %)" for label, s in zip(found.added, shares, strict=True)]
+    if max(shares) >= found.outcome.cfg.verdict.most:
         return f"Missing: {', '.join(parts)}."
     return f"Missing: several effects, none of which dominates: {', '.join(parts)}."
 
@@ -258,17 +327,17 @@ def percent_text(share: float) -> str:
     return f"{percent:.0f}" if round(percent) else f"{percent:.1g}"
 
 
-def ladder(found: Findings) -> list[dict[str, Any]]:
-    """Validation RMSE of all joints from the base model to the last effect [rad]."""
+def ladder(found: Findings, wrong: LinkFindings) -> list[dict[str, Any]]:
+    """Validation RMSE of all joints from the base model to the last effect [rad]; links count in the whole robot."""
     steps = [("base model", found.outcome.base_errors)]
-    if found.paying:
-        steps.append((" + ".join(found.paying), found.outcome.final_errors))
+    if names := [*(each.link for each in wrong.wrong if found.refitted), *found.paying]:
+        steps.append((" + ".join(names), found.outcome.final_errors))
     return [{"model": model, "validation_rmse": float(errors.mse.mean().sqrt())} for model, errors in steps]
 
 
 def by_joint(found: Findings, problem: Problem) -> dict[str, dict[str, Any]]:
     """Of each joint its errors, floor and effects."""
-    outcome, model = found.outcome, found.outcome.final.model
+    outcome, model = found.outcome, found.model
     return {
         name: {
             "type": problem.joint_types[j],

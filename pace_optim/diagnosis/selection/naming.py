@@ -26,13 +26,18 @@ class Evidence:
     slight: bool
     """Whether it counts only where the joint is far from the floor without it: it only smooths friction."""
     bars: float
-    """How many of its error bars its size is away from none."""
+    """How many of its error bars its size is away from none; 0 where it has none."""
     uneven: float
     """What a size for each recording would explain of what is left (``unevenness``)."""
     at_bound: bool
     """Whether a parameter of it has run into a bound."""
     implausible: bool
     """Whether its size is one that no drive has."""
+
+    @property
+    def rise(self) -> float:
+        """By how much the joint's squared error rises without it [rad²]."""
+        return self.without - self.left
 
     @property
     def explained(self) -> float:
@@ -49,17 +54,17 @@ class Evidence:
 
             s = √(u e² / (g² - e²))
         """
-        return math.sqrt(max(0.0, self.uneven) * self.left / max(self.without - self.left, 1e-30))
+        return math.sqrt(max(0.0, self.uneven) * self.left / max(self.rise, 1e-30))
 
 
 def doubts(evidence: Evidence, *, cfg: DiagnosisCfg = DEFAULT) -> list[str]:
     """What speaks against naming an effect, each to be read after "but"; none where its name is earned.
 
-    An effect is named where it explains more than it leaves of what lies above the floor, and has a size that drives
-    have. Where its joint does not end near the floor, its size must also be surely not zero, the same in every
-    recording, and away from its bounds. Beside a larger effect it counts only on what that leaves far from the floor.
-    For effects beside a larger one, also on other joints of its tree, take up what the model of the larger one gets
-    wrong.
+    An effect is named where it explains more than it leaves of what lies above the floor. Its size must be one that
+    drives have, and surely not zero by its error bars. Where its joint does not end near the floor, its size must also
+    have an error bar, be the same in every recording, and be away from its bounds. Beside a larger effect it counts
+    only on what that leaves far from the floor: effects there, also on other joints of its tree, take up what the model
+    of the larger one gets wrong.
     """
     near = cfg.judging.far**2 * evidence.floor
     if (evidence.larger or evidence.slight) and evidence.without <= near:
@@ -68,7 +73,7 @@ def doubts(evidence: Evidence, *, cfg: DiagnosisCfg = DEFAULT) -> list[str]:
         return [f"it explains {100 * max(0.0, evidence.explained):.0f} % of what lies above the floor"]
     far = evidence.left > near
     return [
-        *(["its size is not significant"] if far and evidence.bars < SURE else []),
+        *(["its size is not significant"] if evidence.bars < SURE and (far or evidence.bars > 0) else []),
         *(["its size differs between recordings"] if far and evidence.scatter > cfg.verdict.scatter else []),
         *(["it is at a bound"] if far and evidence.at_bound else []),
         *(["no drive has such a value"] if evidence.implausible else []),

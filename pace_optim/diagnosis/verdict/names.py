@@ -42,8 +42,8 @@ class Names:
     """Joints with effects that are named, (n,) bool."""
     hints: list[Hint]
     """Effects of the others."""
-    rises: Mapping[tuple[type[Effect], int], float]
-    """By how much a joint's squared error rises without an effect [rad²]."""
+    evidence: Mapping[tuple[type[Effect], int], Evidence]
+    """What is known of each effect on each joint by itself, also of those that were dropped."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -71,17 +71,17 @@ def earned_names(fits: Fits, outcome: Outcome, floor: torch.Tensor, log: Log = u
     now, errors = outcome.final, outcome.final_errors
     open_, failed = new_effects(outcome, now.model).any(dim=0), torch.zeros(len(floor), dtype=torch.bool)
     hints: dict[int, Hint] = {}
-    rises: dict[tuple[type[Effect], int], float] = {}
+    known: dict[tuple[type[Effect], int], Evidence] = {}
     while bool(open_.any()):
         if now.jacobian is None or now.error is None:
             now = fits.looked_at(outcome.problem, [now])[0]
-        every = _left_out(fits, outcome, now, errors, open_, floor, rises)
+        every = _left_out(fits, outcome, now, errors, open_, floor, known)
         count = new_effects(outcome, now.model).sum(dim=0)
         earned = {effect: _earned(effect, own, outcome, errors, log) for effect, own in every.items()}
         for j in open_.nonzero()[:, 0].tolist():
             here = torch.arange(len(floor)) == j
             evidence = {effect: own.evidence[j] for effect, own in every.items() if j in own.evidence}
-            rises |= {(effect, j): each.without - each.left for effect, each in evidence.items()}
+            known |= {(effect, j): each for effect, each in evidence.items()}
             weak = [effect for effect in evidence if j not in earned[effect]]
             weakest = min(weak, key=lambda effect: evidence[effect].without, default=None)
             if weakest is None or int(count[j]) == 1:
@@ -94,14 +94,14 @@ def earned_names(fits: Fits, outcome: Outcome, floor: torch.Tensor, log: Log = u
                     model, own = outcome.base, outcome.base_errors
                 if float(own.mse[j]) > (outcome.cfg.judging.far * float(floor[j])) ** 2:
                     failed = failed | here
-                    hints[j] = _hint(weakest, j, evidence[weakest], outcome)
+                    hints[j] = hint(weakest, j, every[weakest].evidence, outcome)
                     model, own = outcome.final, outcome.final_errors
             now, errors = now.with_joints(here, model), errors.with_joints(here, own)
     return Names(
         outcome=replace(outcome, final=now, final_errors=errors),
         named=new_effects(outcome, now.model).any(dim=0) & ~failed,
         hints=list(hints.values()),
-        rises=rises,
+        evidence=known,
     )
 
 
@@ -145,7 +145,7 @@ def shares_of(names: Names, outcome: Outcome) -> dict[type[Effect], float]:
     fall = (outcome.base_errors.mse - outcome.final_errors.mse).tolist()
     for effect, has in zip(model.effects, new_effects(outcome, model) | curves_in(model), strict=True):
         joints = has.nonzero()[:, 0].tolist()
-        own = [fall[j] if effect.free_form else names.rises.get((effect, j), 0.0) for j in joints]
+        own = [fall[j] if effect.free_form else names.evidence[effect, j].rise for j in joints]
         if joints:
             rise[effect] = sum(max(0.0, each) for each in own)
     whole = max(sum(rise.values()), 1e-30)
@@ -159,9 +159,9 @@ def _left_out(
     errors: BlockErrors,
     joints: torch.Tensor,
     floor: torch.Tensor,
-    rises: Mapping[tuple[type[Effect], int], float],
+    known: Mapping[tuple[type[Effect], int], Evidence],
 ) -> dict[type[Effect], _LeftOut]:
-    """Each effect left out of a model on some joints, (n,) bool, and the rest fitted again; ``rises`` of the others."""
+    """Each effect left out of a model on some joints, (n,) bool, and the rest fitted again; others are ``known``."""
     model = now.model
     found = [(e, has & joints) for e, has in zip(model.effects, new_effects(outcome, model), strict=True)]
     found = [(effect, has) for effect, has in found if bool(has.any())]
@@ -181,9 +181,13 @@ def _left_out(
         for (effect, has), (_, own) in zip(found, after, strict=True)
         for j in has.nonzero()[:, 0].tolist()
     }
-    rises = {**rises, **{(effect, j): mse - float(errors.mse[j]) for (effect, j), mse in left_without.items()}}
+    rises = {key: each.rise for key, each in known.items()}
+    rises |= {(effect, j): mse - float(errors.mse[j]) for (effect, j), mse in left_without.items()}
     stuck, implausible = model.has_at_bounds(now.x, now.moves), model.implausible(now.physical)
-    harm, hardly_shows = _harm(outcome, errors), outcome.base_errors.mse.sqrt() <= outcome.cfg.judging.far * floor
+    harm, hardly_shows = (
+        harm_of(replace(outcome, final_errors=errors)),
+        outcome.base_errors.mse.sqrt() <= outcome.cfg.judging.far * floor,
+    )
     result = {}
     for (effect, has), (without, own) in zip(found, after, strict=True):
         row, places = model.effects.index(effect), has.nonzero()[:, 0].tolist()
@@ -202,8 +206,6 @@ def _left_out(
             )
             for j in places
         }
-        if effect.shared:
-            evidence = dict.fromkeys(evidence, _together(list(evidence.values())))
         result[effect] = _LeftOut(fitted=without, errors=own, evidence=evidence)
     return result
 
@@ -223,9 +225,12 @@ def _larger(
     return largest if largest > rises[effect, joint] else 0.0
 
 
-def _together(own: Sequence[Evidence]) -> Evidence:
-    """The evidence of all joints that share an effect, as that of one joint."""
-    return Evidence(
+def as_judged(effect: type[Effect], evidence: Mapping[int, Evidence]) -> dict[int, Evidence]:
+    """The evidence that joints are judged by: where an effect is one for all, that of all together."""
+    if not effect.shared or not evidence:
+        return dict(evidence)
+    own = list(evidence.values())
+    together = Evidence(
         without=sum(each.without for each in own),
         left=sum(each.left for each in own),
         floor=sum(each.floor for each in own),
@@ -237,11 +242,12 @@ def _together(own: Sequence[Evidence]) -> Evidence:
         at_bound=any(each.at_bound for each in own),
         implausible=any(each.implausible for each in own),
     )
+    return dict.fromkeys(evidence, together)
 
 
-def _harm(outcome: Outcome, errors: BlockErrors) -> torch.Tensor:
+def harm_of(outcome: Outcome) -> torch.Tensor:
     """By how much the other joints of each joint's tree are worse than with the base model, (n,) [rad²]."""
-    worse = (errors.mse - outcome.base_errors.mse).clamp(min=0.0)
+    worse = (outcome.final_errors.mse - outcome.base_errors.mse).clamp(min=0.0)
     result = torch.zeros_like(worse)
     for tree in map(list, outcome.trees):
         result[tree] = worse[tree].sum() - worse[tree]
@@ -250,10 +256,12 @@ def _harm(outcome: Outcome, errors: BlockErrors) -> torch.Tensor:
 
 def _earned(effect: type[Effect], own: _LeftOut, outcome: Outcome, errors: BlockErrors, log: Log) -> dict[int, str]:
     """Joints on which an effect has earned its name."""
-    evidence = [asdict(each) for each in own.evidence.values()]
+    evidence = [asdict(each) for each in as_judged(effect, own.evidence).values()]
     without = {effect.name: own.errors}
     return decide("name", list(own.evidence), errors, without, cfg=outcome.cfg, log=log, evidence=evidence)
 
 
-def _hint(effect: type[Effect], joint: int, evidence: Evidence, outcome: Outcome) -> Hint:
-    return Hint(effect=effect.name, joint=joint, explained=evidence.explained, doubts=doubts(evidence, cfg=outcome.cfg))
+def hint(effect: type[Effect], joint: int, evidence: Mapping[int, Evidence], outcome: Outcome) -> Hint:
+    """An effect of a joint with what speaks against its name, of its evidence on all its joints."""
+    own = as_judged(effect, evidence)[joint]
+    return Hint(effect=effect.name, joint=joint, explained=own.explained, doubts=doubts(own, cfg=outcome.cfg))

@@ -35,14 +35,12 @@ def sizes(fits: Fits, outcome: Outcome, floor: torch.Tensor, joint_names: tuple[
     found = now.model.has & torch.tensor([not effect.free_form for effect in now.model.effects]).bool()[:, None]
     if not bool(found.any()):
         return []
-    if now.jacobian is None or now.error is None or now.model.shared:  # a common value was held while it was fitted
+    if now.model.shared:  # a common value was held while it was fitted
         now = fits.looked_at(outcome.problem, [now])[0]
+    now = fits.looked_closely(outcome.problem, now)
     std, stuck = standard_deviations(now), now.model.at_bounds(now.x, now.moves)
     std = torch.where(std > 0, torch.hypot(std, _step_shares(fits, outcome.problem, now)), std)
-    stiff = now.model.has & torch.tensor([effect.is_stiff for effect in now.model.effects]).bool()[:, None]
-    # contacts make the error rough: above the floor its derivatives say little of how sure a size is
-    above = outcome.final_errors.mse.sqrt() > outcome.cfg.judging.alike * floor
-    far = (outcome.far(floor) | (stiff.any(dim=0) & above)).tolist()
+    unsure = without_error_bars(outcome, floor).tolist()
     result = []
     for effect, has in zip(now.model.effects, found, strict=True):
         columns = now.model.columns(effect)
@@ -56,7 +54,7 @@ def sizes(fits: Fits, outcome: Outcome, floor: torch.Tensor, joint_names: tuple[
                     "parameter": parameter.name,
                     "joint": joint_names[j],
                     "value": value,
-                    "std": error if error > 0 and not far[j] else None,
+                    "std": error if error > 0 and not unsure[j] else None,
                     "unit": parameter.unit,
                     "factor": factor_of(effect, parameter, value),
                     "at_bound": held_back,
@@ -64,6 +62,15 @@ def sizes(fits: Fits, outcome: Outcome, floor: torch.Tensor, joint_names: tuple[
                 for parameter, value, error, held_back in zip(effect.parameters, *values, strict=True)
             ]
     return result
+
+
+def without_error_bars(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
+    """Joints whose sizes have no error bar, (n,) bool: far from the floor (n,) [rad], or stiff and above it."""
+    model = outcome.final.model
+    stiff = model.has & torch.tensor([effect.is_stiff for effect in model.effects]).bool()[:, None]
+    # contacts make the error rough: above the floor its derivatives say little of how sure a size is
+    above = outcome.final_errors.mse.sqrt() > outcome.cfg.judging.alike * floor
+    return outcome.far(floor) | (stiff.any(dim=0) & above)
 
 
 def factor_of(effect: type[Effect], parameter: EffectParameter, value: float) -> float | None:
@@ -111,16 +118,17 @@ def _step_shares(fits: Fits, problem: TwinProblem, now: Fitted) -> torch.Tensor:
     return result * now.model.box.slope(now.x)
 
 
-def error_bars_from_none(now: Fitted) -> torch.Tensor:
+def error_bars_from_none(now: Fitted, std: torch.Tensor | None = None) -> torch.Tensor:
     """How many of its error bars each effect's size is away from none, (effects, n); zero without the effect.
 
     Of a parameter p with the null p₀ it is |p - p₀| / σ, on a logarithmic scale |ln p - ln p₀| p / σ, and p / σ where
     the null is infinite; of several the largest. One at a bound has no error bar and does not count.
 
     Args:
-        now: A model, fitted, with its Jacobian.
+        now: A model, fitted.
+        std: Physical standard deviations, (n, P), zero without error bar; ``None``: from its Jacobian.
     """
-    std, physical = standard_deviations(now), now.physical
+    std, physical = standard_deviations(now) if std is None else std, now.physical
     result = torch.zeros(now.model.has.shape, dtype=torch.float64)
     for row, (effect, has) in enumerate(zip(now.model.effects, now.model.has, strict=True)):
         for column, p in enumerate(effect.parameters, start=now.model.columns(effect).start):

@@ -33,7 +33,7 @@ def verdict(outcome: Outcome, floor: torch.Tensor, named: torch.Tensor) -> tuple
     with_curve = curves_in(outcome.final.model).any(dim=0)
     named = named & ~with_curve
     if bool(named.any()):
-        return "effect", _restricted(outcome, named | with_curve)
+        return "effect", restricted(outcome, named | with_curve)
     hinted = new_effects(outcome, outcome.final.model).any(dim=0)
     above = outcome.final_errors.mse.sqrt() > outcome.cfg.judging.clear * floor
     return "unknown" if bool((above | with_curve | hinted).any()) else "nothing_missing", outcome
@@ -45,7 +45,7 @@ def part_explained(outcome: Outcome, floor: torch.Tensor) -> float:
     return 1 - float(after.sum() / before.sum().clamp(min=1e-30))
 
 
-def _restricted(outcome: Outcome, joints: torch.Tensor) -> Outcome:
+def restricted(outcome: Outcome, joints: torch.Tensor) -> Outcome:
     """The outcome with the base model on all joints but these, (n,) bool."""
     others = ~joints & outcome.final.model.has.any(dim=0)
     return replace(

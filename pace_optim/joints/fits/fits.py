@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import torch
@@ -50,6 +50,7 @@ class JointDescent:
         """
         self._cfg = cfg
         self.model, self.tried, self._samples, self._keep = start.model, start.tried, samples, keep
+        self._lengths = start.steps
         n = len(start.x)
         self.x = start.x.clone()
         self.score = torch.full((n,), torch.inf, dtype=torch.float64)
@@ -80,7 +81,7 @@ class JointDescent:
             at, linear = self._linear_model(j)
             trials[:, j, at] = linear.trials(self.x[j, at], float(self._damping[j]), TRIALS)
         favoured = trials[0]
-        width = self._widths[self._width][:, None]
+        width = self._widths[self._width][:, None] if self._lengths is None else self._lengths
         self._step = torch.where(favoured > 0, -width, width)
         neighbours = favoured.repeat(self._gradient.shape[1], 1, 1)
         for j, at in enumerate(self._free):
@@ -265,6 +266,19 @@ class Fits:
         starts = [Fitted.start(each.model, each.physical, tried=each.tried) for each in models]
         return self.side_by_side(problem, starts, 1, keep_jacobian=True)  # one iteration does not move
 
+    def looked_closely(self, problem: TwinProblem, now: Fitted) -> Fitted:
+        """A model where it is, with derivatives over steps that change each joint by as much as its error is.
+
+        A parameter that hardly moves a joint needs long steps: over short ones, friction that sticks moves it more.
+        """
+        if now.jacobian is None or now.error is None:
+            now = self.looked_at(problem, [now])[0]
+        assert now.jacobian is not None and now.error is not None
+        moves, error = (each.double().square().mean(dim=(-3, -2)).sqrt() for each in (now.jacobian, now.error))
+        steps = (error / moves.clamp(min=1e-12)).clamp(self.cfg.narrow, self.cfg.wide[0]).T
+        start = replace(Fitted.start(now.model, now.physical, tried=now.tried), steps=steps)
+        return self.side_by_side(problem, [start], 1, keep_jacobian=True)[0]
+
     def side_by_side(
         self,
         problem: TwinProblem,
@@ -398,7 +412,7 @@ class Fits:
             going = [way for way in running if not way.finished]
             if not going:
                 break
-            if len(going) < cfg.thinned * len(running):
+            if len(going) <= len(running) / 2:  # changes time alone
                 running, batch = going, self._batch_of(problem, going)
         if chords:
             batch = self.batch(problem, [Slot(model=way.model, rows=1) for way in ways], training=True)

@@ -26,6 +26,8 @@ class Fitted:
     """Derivatives of the errors at x (P, K, R, n) float32, where wanted."""
     error: torch.Tensor | None = None
     """At x, (K, R, n) float32, where wanted."""
+    steps: torch.Tensor | None = None
+    """Normalised steps that its next derivatives are taken over, (n, P); ``None``: those of the fit."""
     falls: bool = False
     """Whether its error was still falling when its iterations were over."""
 
@@ -69,6 +71,7 @@ class Fitted:
             score=self.score[joints],
             jacobian=None if self.jacobian is None else self.jacobian[entries][..., joints],
             error=None if self.error is None else self.error[..., joints],
+            steps=None if self.steps is None else self.steps[joints][:, entries],
         )
 
     def with_joints(self, joints: torch.Tensor, own: Fitted) -> Fitted:

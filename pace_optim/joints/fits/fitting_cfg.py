@@ -38,8 +38,6 @@ class FittingCfg:
     """A model still falls whose squared error has fallen by more than this part over the last ``rounds`` iterations."""
     gain: float = 0.9
     """The reference is renewed, or windows are left out, again where that lowered the error to less than this part."""
-    thinned: float = 0.8
-    """With less than this part of the models still on their way, only those are simulated. Changes time alone."""
     behind: float = 3.0
     """A model is not worth the finer step above this many times the best one's RMSE, and a window is an outlier above
     this many times the median."""

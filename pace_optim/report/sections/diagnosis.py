@@ -178,7 +178,8 @@ def _joints(content: dict[str, Any]) -> Markup:
         ]
         for (name, joint), own in zip(joints.items(), types, strict=True)
     ]
-    about = "each joint simulated alone, validation error"
+    how = "whole robot" if len(content["runs"]) > 1 else "each joint simulated alone"
+    about = f"{how}, validation error"
     return _titled(
         "Joint by joint", table(["joint", f"before [{_unit(content)}]", "after", "floor", "effects"], rows), about
     )

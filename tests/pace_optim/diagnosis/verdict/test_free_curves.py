@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from diagnoses import FITS, hidden_run
+from diagnoses import FITS, hidden_run, make_evidence
 from problems import BENCH, CALM
 
 from pace_actuators.effects import available_effects, get_effect
@@ -232,7 +232,12 @@ def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeyp
         ("fit_curves", curves),
         (
             "earned_names",
-            Names(outcome=outcome, named=four == 0, hints=[], rises={(spring, 0): 36e-6, (spring, 2): 1e-6}),
+            Names(
+                outcome=outcome,
+                named=four == 0,
+                hints=[],
+                evidence={(spring, j): make_evidence(rise, 0.0, 1e-8) for j, rise in ((0, 36e-6), (2, 1e-6))},
+            ),
         ),
     ):
         monkeypatch.setattr(sys.modules[search_effects.__module__], name, lambda *_, result=result, **__: result)

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from diagnoses import FakeFits, errors_of, hidden_run, joint_alone, with_effects
+from diagnoses import FakeFits, errors_of, hidden_run, joint_alone, make_evidence, with_effects
 from problems import CALM
 
 from pace_actuators.effects import get_effect
@@ -18,7 +18,7 @@ from pace_optim.diagnosis.checks.stated_facts import excluded_effects
 from pace_optim.diagnosis.findings import findings
 from pace_optim.diagnosis.findings.findings import Findings, summary_of
 from pace_optim.diagnosis.search.state import Outcome
-from pace_optim.diagnosis.selection.naming import Evidence, doubts
+from pace_optim.diagnosis.selection.naming import doubts
 from pace_optim.diagnosis.selection.size_consistency import unevenness
 from pace_optim.diagnosis.verdict import names as names_module
 from pace_optim.diagnosis.verdict.names import Hint, earned_names, shares_of
@@ -29,22 +29,12 @@ from pace_optim.joints.fits.labels import labels
 from pace_optim.joints.fits.model import BASE, JointModel
 from pace_optim.recording import Load
 from pace_optim.report import write_report
+from pace_optim.run.result import FitResult
 
 SPRING, QUADRATIC, STRIBECK = (get_effect(n) for n in ("parallel_spring", "quadratic_friction", "stribeck_friction"))
 CREEP, SKEW = get_effect("creeping_friction"), get_effect("clock_skew")
 FLOOR, YES = torch.tensor([1e-4]).double(), torch.tensor([True])
-SURE = Evidence(
-    without=100.0,
-    left=20.0,
-    floor=1.0,
-    harm=0.0,
-    larger=0.0,
-    slight=False,
-    bars=50.0,
-    uneven=0.0,
-    at_bound=False,
-    implausible=False,
-)
+SURE = make_evidence(100.0, 20.0, 1.0)
 """In units of the squared floor: far from it with the effect too."""
 
 
@@ -65,6 +55,7 @@ SURE = Evidence(
         ({"at_bound": True}, ["it is at a bound"]),
         ({"implausible": True}, ["no drive has such a value"]),
         ({"left": 8.0, "bars": 0.0, "uneven": 1.0, "at_bound": True}, []),  # it explains everything
+        ({"left": 8.0, "bars": 1.9}, ["its size is not significant"]),
         ({"left": 4.0, "implausible": True}, ["no drive has such a value"]),  # a proxy near the floor
         ({"left": 8.0, "harm": 2.0, "uneven": 1.0}, []),  # what it does to other joints is no doubt about its size
         ({"without": 8.0, "left": 1.0}, []),  # the first one of a joint
@@ -132,7 +123,8 @@ def test_effects_share_what_is_lost_without_them(bench, monkeypatch):
         (5e-3, 1e-2, 50.0, "effect", 0),
         (5e-3, 1e-2, 1.0, "unknown", 1),
         (9e-3, 1e-2, 50.0, "unknown", 1),
-        (2e-4, 1e-2, 1.0, "effect", 0),
+        (2e-4, 1e-2, 0.0, "effect", 0),
+        (2e-4, 1e-2, 1.0, "unknown", 1),
         (1.2e-4, 1.25e-4, 50.0, "nothing_missing", 0),
     ],
 )
@@ -278,8 +270,9 @@ def told_of(outcome, decision, shares, hints=()):
         absorbed={},
         verdict=decision,
         explained=0.75,
-        paying=labels(outcome.final.model, ["servo"], list(shares)),
+        joint_names=["servo"],
         shares=shares,
+        named={(effect, 0): SURE for effect in shares if decision == "effect"},
         hints=hints,
     )
 
@@ -321,6 +314,8 @@ def test_it_is_fitted_to_the_whole_robot_all_the_same(run, bench, monkeypatch, s
         if stopped == "interrupted":
             raise KeyboardInterrupt
         shutil.copytree(run.folder, refit, dirs_exist_ok=True)
+        half = {part: dict.fromkeys(("servo", "all"), 0.002) for part in ("train", "validation")}
+        replace(FitResult.load(run.folder), rmse=half).save(refit / "result.json")  # the run has 4 mrad
         return SimpleNamespace(stop_reasons=[stopped]), refit
 
     (run.folder.parent / "refit").mkdir(exist_ok=True)

@@ -14,7 +14,7 @@ from pace_actuators.effects import get_effect
 from pace_actuators.files import write_json
 from pace_actuators.text import size_text
 from pace_optim.diagnosis import Diagnosis
-from pace_optim.diagnosis.findings.findings import percent_text, with_refit
+from pace_optim.diagnosis.findings.findings import percent_text
 from pace_optim.diagnosis.findings.text import lines_of, size_lines
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.verdict.sizes import factor_of, sizes
@@ -94,24 +94,6 @@ def test_the_report_opens_with_the_verdict_its_sizes_and_the_run_that_has_it(tmp
     assert 'href="../refit/report.html"' in html[0] and 'href="../run/report.html"' in html[1]
 
 
-def test_a_size_is_that_of_the_whole_robot_s_fit_once_it_is_done(tmp_path):
-    gap, joint = SIZE | {"effect": "backlash", "parameter": "gap"}, SIZE["joint"]
-    others = [SIZE | {"effect": "payload", "parameter": "mass"}, gap]
-    found = Diagnosis(**make_diagnosis() | {"sizes": [SIZE, *others], "joints": {joint: {"floor": 1e-4}}})
-    names = ("torque_gain.gain", "backlash.gap")
-    result = SimpleNamespace(
-        rmse={"validation": {"all": 1e-3, joint: 2e-4}},
-        joint_types=["hinge"],
-        parameters={name: {"all": 0.5} for name in names},
-        std={name: {"all": 0.01} for name in names},
-        std_means_nothing=False,
-        at_bound=[],
-    )
-    first, second, third = with_refit(found, result, result, tmp_path).sizes
-    assert first == SIZE | {"value": 0.5, "factor": 0.5, "std": 0.01} and second == others[0]
-    assert third["value"] == 0.5 and third["std"] is None  # contacts, and above the floor
-
-
 def ended(problem, final):
     """A search that ended with a model at 1 mrad."""
     errors = errors_of(*[1e-3] * len(final.x))
@@ -156,6 +138,9 @@ def test_a_value_that_joints_share_has_the_error_bar_of_them_all_and_of_the_step
 
         def looked_at(self, problem, models):
             return [replace(each, jacobian=one, error=error) for each in models]
+
+        def looked_closely(self, problem, now):
+            return replace(now, jacobian=one, error=error)
 
         def trained_errors(self, problem, now):
             return error + self.change * one[model.columns(GAIN).start]

@@ -408,3 +408,21 @@ def test_a_model_that_still_falls_goes_on_while_it_is_near_the_best():
     assert asked[:3] == [("coarse", list(scores)), ("coarse", ["slow", "best"]), ("coarse", ["slow", "best"])]
     near = ["slow", "done", "best"]
     assert asked[3:] == [("windows", near), (problem, near)]  # then the finer step, at last on whole recordings
+
+
+def test_derivatives_of_error_bars_move_a_joint_by_as_much_as_its_error(bench, monkeypatch):
+    """A filter of 16 ms had an error bar of 5 us: over a short step, friction that sticks moved the joint more."""
+    model = JointModel.base(bench.problem)
+    now = Fitted.start(model, torch.tensor([[CALM[name] for name in BASE]], dtype=torch.float64))
+    moves = torch.tensor([1.0, 1e-2, 1e-3, 0.0, 2e-2])
+    jacobian = moves[:, None, None, None].expand(-1, 100, 2, 1)
+    seen = replace(now, jacobian=jacobian, error=torch.full((100, 2, 1), 1e-4))
+    began = []
+    monkeypatch.setattr(Fits, "side_by_side", lambda self, problem, starts, *_, **__: began.append(starts[0]) or starts)
+    FITS.looked_closely(bench.twins, seen)
+    narrow, longest = DEFAULT.fitting.narrow, DEFAULT.fitting.wide[0]
+    expected = [narrow, 1e-2, longest, longest, 5e-3]
+    assert began[0].steps[0].tolist() == pytest.approx(expected, rel=1e-5)
+    rows = descent(began[0]).ask()
+    neighbours = rows[1 : 1 + model.most_free, 0] - rows[0, 0]
+    assert neighbours.diagonal().abs().tolist() == pytest.approx(expected, rel=1e-5)
