@@ -261,7 +261,7 @@ class TracedDelay(DelayBuffer):
     def _rows(self, steps: torch.Tensor) -> torch.Tensor:
         return steps
 
-    def _seen(self, rows: torch.Tensor) -> torch.Tensor:
+    def _seen(self, rows: Any) -> torch.Tensor:
         if self.ring is None:
             raise NotTraceableError("a delay that is read before it has a sample")
         return self._tracer.tensor(self._tracer.tape.new("ring", self._tracer.node(rows), index=self.ring))
