@@ -1,7 +1,8 @@
 """A delay of a real number of steps, one per environment."""
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
+from functools import partial
 from typing import Literal, NamedTuple
 
 import torch
@@ -25,6 +26,21 @@ class Jump(NamedTuple):
 
     share: torch.Tensor
     """The part of the time that is before the change, (num_envs, 1 or num_joints)."""
+
+
+class _Rows:
+    """Rows of a storage for every head position, tabulated when one is asked for: most lags are replaced before."""
+
+    def __init__(self, tabulate: Callable[[], torch.Tensor]):
+        """Keep how to tabulate."""
+        self._tabulate = tabulate
+        self._table: torch.Tensor | None = None
+
+    def __getitem__(self, head: int) -> torch.Tensor:
+        """Those of a head position."""
+        if self._table is None:
+            self._table = self._tabulate()
+        return self._table[head]
 
 
 class DelayBuffer(Part):
@@ -259,7 +275,7 @@ class DelayBuffer(Part):
 
     def _index_parts(self) -> None:
         """The same for every part of a step: the newer and the older sample, and the older one's weight."""
-        self._at: dict[int, tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]] = {}
+        self._at: dict[int, tuple[torch.Tensor | _Rows, torch.Tensor | _Rows, torch.Tensor | None]] = {}
         self._switches: set[int] = set()
         if self.parts == 1 or self.interpolation == "hold":
             return
@@ -277,10 +293,12 @@ class DelayBuffer(Part):
     def _all(self, which: torch.Tensor) -> bool:
         return bool(which.all())
 
-    def _rows(self, steps: torch.Tensor) -> torch.Tensor:
+    def _rows(self, steps: torch.Tensor) -> torch.Tensor | _Rows:
         """What :meth:`_seen` takes for the samples so many steps back."""
-        if self._on_device:
-            return steps.long()
+        return steps.long() if self._on_device else _Rows(partial(self._tabulated, steps))
+
+    @torch.inference_mode(False)  # the caller's mode may be another one later
+    def _tabulated(self, steps: torch.Tensor) -> torch.Tensor:
         heads = torch.arange(self._length, device=self._device)[:, None]
         envs = torch.arange(self._num_envs, device=self._device)
         if steps.shape[1] == 1:
@@ -289,7 +307,7 @@ class DelayBuffer(Part):
             heads, back, envs = heads[..., None], steps.long(), envs[:, None]
         return ((heads - back) % self._length) * self._num_envs + envs
 
-    def _seen(self, rows: torch.Tensor) -> torch.Tensor:
+    def _seen(self, rows: torch.Tensor | _Rows) -> torch.Tensor:
         """Samples of the past, (num_envs, num_joints).
 
         Args:
@@ -297,7 +315,7 @@ class DelayBuffer(Part):
                 head position, whole ones or, with a lag per joint, of single entries.
         """
         assert self._storage is not None  # a sample was pushed before
-        if not self._on_device:
+        if isinstance(rows, _Rows):
             index = rows[self._head]
             return self._storage.index_select(0, index) if index.ndim == 1 else self._storage.gather(0, index)
         history = self._storage.view(self._length, self._num_envs, -1)

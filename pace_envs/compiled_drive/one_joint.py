@@ -17,7 +17,7 @@ from pace_actuators.effects import Effect
 from pace_actuators.effects.drive_state import DriveState
 from pace_actuators.part import Part
 from pace_envs.compiled_drive.drive_code import Program, Read
-from pace_envs.compiler.operations import TYPES, UNARY, is_compared, rule
+from pace_envs.compiler.operations import COMPARED, TYPES, UNARY, rule
 from pace_envs.compiler.tape import Node, NotTraceableError, Tape
 from pace_envs.compiler.tracer import Tracer, tensors_in
 from pace_envs.mdp import JointPositionAction
@@ -146,7 +146,7 @@ class JointTracer(Tracer):
             return None if node is None else self._result(node, like.ndim, target)
         if self._tables and any(each.numel() != 1 for each in tensors):
             raise NotTraceableError("a table among numbers")
-        compared = is_compared(name)
+        compared = name in COMPARED
         dtype = kwargs.get("dtype") or (target.dtype if target is not None else _type_of(name, args, tensors))
         found = rule(name, args, kwargs, dtype) if dtype in TYPES else None
         if found is None:
@@ -206,7 +206,7 @@ class JointTracer(Tracer):
 
 def _type_of(name: str, args: Sequence[Any], tensors: Sequence[torch.Tensor]) -> torch.dtype:
     """The type of an operation's result."""
-    if is_compared(name):
+    if name in COMPARED:
         return torch.bool
     if name in _LIKE_THE_FIRST:
         return args[0].dtype
@@ -261,7 +261,7 @@ class TracedDelay(DelayBuffer):
     def _rows(self, steps: torch.Tensor) -> torch.Tensor:
         return steps
 
-    def _seen(self, rows: torch.Tensor) -> torch.Tensor:
+    def _seen(self, rows: Any) -> torch.Tensor:
         if self.ring is None:
             raise NotTraceableError("a delay that is read before it has a sample")
         return self._tracer.tensor(self._tracer.tape.new("ring", self._tracer.node(rows), index=self.ring))

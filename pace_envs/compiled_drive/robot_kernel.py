@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import weakref
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,13 +13,13 @@ import mujoco
 import numpy as np
 import torch
 
+from pace_actuators import PaceDCMotor
 from pace_envs.articulation import Articulation
 from pace_envs.compiled_drive.drive_code import Program
-from pace_envs.compiled_drive.one_joint import HELD, Commands, commands
-from pace_envs.compiled_drive.robot import record_drive
-from pace_envs.compiled_drive.robot_source import ARGUMENTS, RobotSource, robot_source
-from pace_envs.compiler.host import CannotCompileError, HostKernels, mujoco_kernels
-from pace_envs.compiler.tape import NotTraceableError
+from pace_envs.compiled_drive.one_joint import HELD, Commands, JointTracer, OneJoint, commands, position_term
+from pace_envs.compiled_drive.robot_source import ARGUMENTS, STATE, WRITTEN, RobotSource, robot_source
+from pace_envs.compiler.host import CannotCompileError, mujoco_kernels
+from pace_envs.compiler.tape import Node, NotTraceableError
 from pace_envs.manager_based_env import ManagerBasedEnv
 from pace_envs.simulation import Simulation, available_processors
 
@@ -31,7 +31,11 @@ _BLOCK = 40_000
 
 
 class CompiledRobot:
-    """A robot's recordings by compiled drives, where these can be compiled and that pays."""
+    """A robot's recordings by compiled drives, where these can be compiled and that pays.
+
+    Parameters have been written, and the first control step has been made. The numbers are those of stepping the
+    environment itself, whose own state stays where it is.
+    """
 
     def __init__(self, env: ManagerBasedEnv, dataset: Commands, course: Course | None = None):
         """Nothing is recorded yet; environment c * R + r follows recording r.
@@ -42,7 +46,11 @@ class CompiledRobot:
             course: How bases move and joints are held; ``None``: they rest, and all joints are free.
         """
         self._env, self._dataset, self._course = env, dataset, course
-        self._kernel: RobotKernel | None = None
+        self._branches: object = None
+        self._programs: list[Program] = []
+        self._source: RobotSource
+        self._series: torch.Tensor
+        self._batch: _Batch | None = None
         self._refused = False
 
     def positions(
@@ -62,71 +70,41 @@ class CompiledRobot:
         if kernels is None:
             return None
         try:
-            if self._kernel is None:
-                self._kernel = RobotKernel(self._env, self._dataset, kernels, self._course)
-            self._kernel.record(torque is not None)
-            return self._kernel.positions(at, state, torque) if self._kernel.pays(int(at[-1])) else None
+            self._record(torque is not None)
+            source, end = self._source.source, int(at[-1])
+            if not kernels.pays(source, end * self._env.cfg.decimation):
+                return None
+            kernels.compile([source])
+            return self._simulated(kernels.address_of(source), at, state, torque)
         except CannotCompileError:
             self._refused = True
             return None
 
-
-class RobotKernel:
-    """Simulates environments whose parameters have been written and whose first control step has been made.
-
-    The numbers are those of stepping the environment itself. Its own state stays where it is.
-    """
-
-    def __init__(self, env: ManagerBasedEnv, dataset: Commands, kernels: HostKernels, course: Course | None = None):
-        """Record what the drives do.
-
-        Args:
-            env: The environment; environment c * R + r follows recording r.
-            dataset: The recordings.
-            kernels: Compiles.
-            course: How bases move and joints are held.
+    def _record(self, with_torques: bool) -> None:
+        """Record what the drives do, unless that was recorded with the same branches.
 
         Raises:
             NotTraceableError: If a kernel cannot do it.
         """
-        robot, sim = env.scene["robot"], env.sim
+        env, robot, sim, course = self._env, self._env.scene["robot"], self._env.sim, self._course
+        drives = robot.actuators.values()
+        branches = [with_torques, *(actuator.branches() for actuator in drives)]
+        if branches == self._branches:
+            return
         own = type(robot) is Articulation and type(sim) is Simulation and type(env).simulate is ManagerBasedEnv.simulate
         holds_loops = course is not None and robot.closed_loops is not None
         if not own or holds_loops or sim.cfg.integrator == "implicit":
             raise NotTraceableError("a simulation of the user's own")
-        self._env, self._dataset, self._kernels, self._course = env, dataset, kernels, course
-        self._branches: object = None
-        self._programs: list[Program] = []
-        self._source: RobotSource
-        self._series: torch.Tensor
-        self._batch: _Batch | None = None
-        self.record()
-
-    def pays(self, steps: int) -> bool:
-        """Whether it is worth compiling for so many control steps more."""
-        return self._kernels.pays(self._source.source, steps * self._env.cfg.decimation)
-
-    def record(self, with_torques: bool = False) -> None:
-        """Record what the drives do, unless that was recorded with the same branches.
-
-        Args:
-            with_torques: Whether the motors' torques are shown, too.
-        """
-        robot = self._env.scene["robot"]
-        branches = [with_torques, *(actuator.branches() for actuator in robot.actuators.values())]
-        if branches == self._branches:
-            return
         self._branches = branches
-        drives = robot.actuators.values()
-        shift = None if self._course is None else self._course.shift
-        self._programs = [record_drive(self._env, self._dataset, each, with_torques, shift) for each in drives]
+        shift = None if course is None else course.shift
+        self._programs = [record_drive(env, self._dataset, each, with_torques, shift) for each in drives]
         self._source = robot_source(
             self._programs,
             robot._layout.qpos_columns,
             robot._layout.dof_columns,
             robot.num_joints,
             mujoco.mj_versionString(),
-            self._env.sim.coordinates,
+            sim.coordinates,
         )
         series = [self._one(name).double() for name in self._source.series]
         self._series = torch.stack(series).contiguous() if series else torch.zeros(1, dtype=torch.float64)
@@ -138,22 +116,11 @@ class RobotKernel:
         position, speed = self._course.held.unbind(dim=-1)
         return {HELD[0]: position.isnan(), HELD[1]: position.nan_to_num(), HELD[2]: speed.nan_to_num()}[name]
 
-    def positions(
-        self, at: torch.Tensor, state: torch.Tensor | None = None, torque: torch.Tensor | None = None
+    def _simulated(
+        self, function: int, at: torch.Tensor, state: torch.Tensor | None, torque: torch.Tensor | None
     ) -> torch.Tensor:
-        """What the encoders show, without their bias, at control steps after the first, (len(at), num_envs, n) [rad].
-
-        Args:
-            at: Control steps, ascending, all above 0.
-            state: Gets MuJoCo's positions and speeds at them, (len(at), num_envs, nq + nv) float64.
-            torque: Gets the motors' torques at them, (len(at), num_envs, n) float64 [N m].
-
-        Raises:
-            CannotCompileError: If what was recorded cannot be compiled.
-            ValueError: If MuJoCo refuses to step a robot.
-        """
+        """What :meth:`positions` gives, by the function at an address."""
         source, env, end = self._source, self._env, int(at[-1])
-        self._kernels.compile([source.source])
         if self._batch is None:
             self._batch = _Batch(env.sim)
         self._batch.begin(env.sim)
@@ -190,8 +157,102 @@ class RobotKernel:
         for first in range(1, end + 1, block):
             arguments |= {"first": first, "last": min(first + block, end + 1)}
             told = [*(arguments[name] for name in ARGUMENTS), *(leaf.data_ptr() for leaf in leaves)]
-            self._batch.apply(self._kernels.address_of(source.source), np.array(told, dtype=np.int64))
+            self._batch.apply(function, np.array(told, dtype=np.int64))
         return tensors["out"]
+
+
+def record_drive(
+    env: ManagerBasedEnv,
+    dataset: Commands,
+    actuator: PaceDCMotor,
+    with_torques: bool,
+    shift: torch.Tensor | None = None,
+) -> Program:
+    """What a control step does to the joints of a drive, in all environments.
+
+    Args:
+        env: The environment; it has made a control step.
+        dataset: The recordings whose commands it follows.
+        actuator: One of its robot's drives.
+        with_torques: Whether the motors' torques are shown, too.
+        shift: Added to what encoders are held at, (num_envs, n, 2) [rad, rad/s]; ``None``: none is held.
+
+    Raises:
+        NotTraceableError: If a kernel cannot do it.
+    """
+    robot, stack = env.scene["robot"], actuator.effects
+    if type(actuator) is not PaceDCMotor:
+        raise NotTraceableError("a drive of the user's own")
+    position_term(env)
+    every = range(env.num_envs)
+    if stack is not None and any(effect.rows.indices(env.num_envs) != (0, len(every), 1) for effect in stack.effects):
+        raise NotTraceableError("effects of some environments only")
+    joint = OneJoint(robot, actuator, every)
+    with joint.noting():
+        sim = _Physics(joint.tracer, env.sim)
+        joint.in_robot(sim, dataset)
+        hold = None if shift is None else partial(_hold, joint, sim, shift)
+        shown = joint.control_step(env.cfg.decimation, dataset, with_torques, hold)
+        sim.end()
+        program = joint.program(shown, sim.written)
+    return program
+
+
+def _hold(joint: OneJoint, sim: _Physics, shift: torch.Tensor) -> None:
+    columns = joint.columns
+    own = [joint.leaf(lambda i=i: shift[None, :, columns, i]) for i in range(2)]  # type: ignore[misc]
+    for field, held in zip((sim.qpos, sim.qvel), joint.held(*own), strict=True):
+        field.copy_(held)
+
+
+class _Physics:
+    """Stands in for the robot's simulation: a step of it is a mark on the tape."""
+
+    write_passive = Simulation.write_passive
+
+    def __init__(self, tracer: JointTracer, sim: Simulation):
+        """Read the state."""
+        self.cfg, self.is_trapezoidal = sim.cfg, sim.is_trapezoidal
+        self.written: list[dict[str, Node]] = []
+        self._tracer = tracer
+        self._fields = {name: tracer.tensor(self._read(name)) for name in (*STATE, *WRITTEN)}
+        self.qpos, self.qvel, self.qfrc_bias, self.qfrc_applied = (
+            self._fields[name] for name in (*STATE, "qfrc_applied")
+        )
+        self._before = self._nodes()
+
+    def expand(self, field: str) -> torch.Tensor:
+        """A field of the model."""
+        if field not in self._fields:
+            raise NotTraceableError(f"the model's {field}")
+        return self._fields[field]
+
+    def felt_link(self, columns: torch.Tensor) -> Any:
+        """Needs more of MuJoCo's fields than are read.
+
+        Raises:
+            NotTraceableError: Always.
+        """
+        raise NotTraceableError("an effect that reads the link's inertia")
+
+    def step(self) -> None:
+        """Write what has changed, and read the state anew."""
+        self.end()
+        for name in STATE:
+            self._tracer.put(self._fields[name], self._read(name))
+        self._before = self._nodes()
+
+    def end(self) -> None:
+        """Write what has changed."""
+        after = self._nodes()
+        self.written.append({name: after[name] for name in WRITTEN if after[name] is not self._before[name]})
+        self._tracer.tape.new("physics", *self.written[-1].values(), index=len(self.written) - 1)
+
+    def _nodes(self) -> dict[str, Node]:
+        return {name: self._tracer.node(self._fields[name]) for name in WRITTEN}
+
+    def _read(self, name: str) -> Node:
+        return self._tracer.tape.new("field", index=(*STATE, *WRITTEN).index(name))
 
 
 def _leaves_of(program: Program, used: Sequence[int]) -> torch.Tensor:

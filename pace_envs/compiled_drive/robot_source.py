@@ -9,13 +9,16 @@ from itertools import accumulate
 import torch
 
 from pace_envs.compiled_drive.drive_code import DriveCode, Program
-from pace_envs.compiled_drive.robot import STATE, WRITTEN
 from pace_envs.compiler.operations import PRELUDE
 from pace_envs.compiler.tape import Node, NotTraceableError
 from pace_envs.coulomb import SOURCE as TURN_FRICTION
 from pace_envs.motor_coordinates import MotorCoordinates
 from pace_envs.moving_frame import COLUMNS, SOURCE
 
+STATE = ("qpos", "qvel", "qfrc_bias")
+"""Fields of MuJoCo's data that drives and effects read."""
+WRITTEN = ("qpos", "qvel", "qfrc_applied", "dof_armature", "dof_frictionloss", "dof_damping")
+"""Fields of MuJoCo's data and model that they write before a physics step."""
 ARGUMENTS = {
     # MuJoCo's functions
     "step1": "void (*step1)(const mjModel*, mjData*)",

@@ -21,33 +21,15 @@ TYPES = {
 }
 """Torch's types in C."""
 
+_FUNCTIONS = "sqrt exp exp2 expm1 log log2 log10 log1p sin cos tan asin acos atan sinh cosh tanh erf floor ceil trunc"
+
 UNARY = {
+    **{name: f"{name}({{0}})" for name in _FUNCTIONS.split()},
     "neg": "(-{0})",
     "abs": "fabs({0})",
     "square": "({0} * {0})",
-    "sqrt": "sqrt({0})",
     "rsqrt": "(1 / sqrt({0}))",
     "reciprocal": "(1 / {0})",
-    "exp": "exp({0})",
-    "exp2": "exp2({0})",
-    "expm1": "expm1({0})",
-    "log": "log({0})",
-    "log2": "log2({0})",
-    "log10": "log10({0})",
-    "log1p": "log1p({0})",
-    "sin": "sin({0})",
-    "cos": "cos({0})",
-    "tan": "tan({0})",
-    "asin": "asin({0})",
-    "acos": "acos({0})",
-    "atan": "atan({0})",
-    "sinh": "sinh({0})",
-    "cosh": "cosh({0})",
-    "tanh": "tanh({0})",
-    "erf": "erf({0})",
-    "floor": "floor({0})",
-    "ceil": "ceil({0})",
-    "trunc": "trunc({0})",
     "round": "rint({0})",
     "sign": "sign_of({0})",
     "sgn": "sign_of({0})",
@@ -63,12 +45,7 @@ BINARY = {
     "div": "({0} / {1})",
     "minimum": "smaller({0}, {1})",
     "maximum": "larger({0}, {1})",
-    "fmin": "fmin({0}, {1})",
-    "fmax": "fmax({0}, {1})",
-    "copysign": "copysign({0}, {1})",
-    "atan2": "atan2({0}, {1})",
-    "hypot": "hypot({0}, {1})",
-    "fmod": "fmod({0}, {1})",
+    **{name: f"{name}({{0}}, {{1}})" for name in ("fmin", "fmax", "copysign", "atan2", "hypot", "fmod")},
     "remainder": "remainder_of({0}, {1})",
 }
 """Of two numbers."""
@@ -88,7 +65,7 @@ COMPARED = {
     "logical_xor": "(({0} != 0) != ({1} != 0))",
     "logical_not": "({0} == 0)",
 }
-"""Whose result is true or false."""
+"""Whose operands are taken in their common type, and whose result is true or false."""
 
 BITS = {
     "bitwise_and": "({0} & {1})",
@@ -185,11 +162,6 @@ def rule(name: str, arguments: Sequence[Any], options: dict[str, Any], dtype: to
     if name == "bitwise_not":
         return arguments[:1], "(!{0})" if dtype == torch.bool else "(~{0})"
     return None
-
-
-def is_compared(name: str) -> bool:
-    """Whether an operation compares operands in their common type and returns true or false."""
-    return name in COMPARED
 
 
 PRELUDE = """

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from pace_envs.compiler.operations import KNOWN, TYPES, is_compared, rule
+from pace_envs.compiler.operations import COMPARED, KNOWN, TYPES, rule
 from pace_envs.compiler.row_source import Operation, Writer
 from pace_envs.compiler.rows import Array, Index, RowSpace, elements
 from pace_envs.compiler.tape import Node, Tape
@@ -51,7 +51,7 @@ def on_elements(space: RowSpace, name: str, args: Sequence[Any], kwargs: dict[st
     if found is None:
         return None
     values, form = found
-    compared = is_compared(name)
+    compared = name in COMPARED
     dtype = torch.result_type(values[0], values[-1]) if compared else result.dtype
     operands = [each for each in (_operand(space, value) for value in values) if each is not None]
     if dtype not in TYPES or len(operands) < len(values):

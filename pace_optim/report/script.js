@@ -145,6 +145,11 @@
       element.querySelector(".errors-here").textContent = curve.text;
       return Plotly.react(canvas, inColor(data), inStyle(layout), CONFIG);
     }
+    return drawnAt(element, content, draw);
+  }
+
+  /** Draw again where a choice changes, or a joint's name is clicked anywhere on the page. */
+  function drawnAt(element, content, draw) {
     element.addEventListener("change", draw);
     document.addEventListener("click", (event) => {
       const joint = event.target.closest?.("[data-joint]")?.dataset.joint;
@@ -176,15 +181,7 @@
           canvas, inColor(data), inStyle(inWidth(merged(figure.layout, filled.layout), canvas)), CONFIG);
       }
     }
-    element.addEventListener("change", draw);
-    document.addEventListener("click", (event) => {
-      const joint = event.target.closest?.("[data-joint]")?.dataset.joint;
-      const input = element.querySelector(`[data-choice="joint"] input[value="${content.joints.indexOf(joint)}"]`);
-      if (!input) return;
-      input.checked = true;
-      draw();
-    });
-    return draw;
+    return drawnAt(element, content, draw);
   }
 
   const drawers = [

@@ -63,7 +63,7 @@ def type_in(warm: WarmPython, name: str, home: Path, start: Path, shorter: dict[
 
 @pytest.mark.slow
 def test_the_tutorial_for_an_own_robot_works_when_typed(warm, tmp_path):
-    shorter = {"--duration 6": "--duration 2", "--duration 3": "--duration 1.5"}
+    shorter = {"--duration 6": "--duration 1", "--duration 3": "--duration 0.8", "--duration 2": "--duration 1"}
     printed = type_in(warm, "your_own_robot.md", tmp_path, ROOT, shorter)
     assert "replay: " in printed
     assert list(tmp_path.glob("my_arm/logs/pace/my_arm/*/result.json"))
@@ -71,7 +71,7 @@ def test_the_tutorial_for_an_own_robot_works_when_typed(warm, tmp_path):
 
 @pytest.mark.slow
 def test_the_tutorial_for_an_own_objective_works_when_typed(warm, tmp_path):
-    type_in(warm, "your_own_objective.md", tmp_path, ROOT, {})
+    type_in(warm, "your_own_objective.md", tmp_path, ROOT, {"--duration 2": "--duration 1"})
 
 
 @pytest.mark.slow

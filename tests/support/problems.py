@@ -166,7 +166,7 @@ def _moved(
         if torque_enable is not None:
             for actuator in robot.actuators.values():
                 actuator.set_torque_enable(torch.tensor([bool(torque_enable[k])]))
-        env.step(command[None])
+        env.simulate(command[None])
     env.close()
     return reading
 

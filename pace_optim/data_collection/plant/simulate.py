@@ -285,21 +285,23 @@ class LateSignal:
 
     def __init__(self, delay: np.ndarray):
         """Delays in integration steps, (R, n)."""
-        self._whole = np.floor(delay + 1e-9).astype(int)
-        self._part = np.maximum(delay - self._whole, 0.0)
+        whole = np.floor(delay + 1e-9).astype(int)
+        self._part = np.maximum(delay - whole, 0.0)
+        self._length = int(whole.max()) + 2
+        now = np.arange(self._length)[:, None, None]
+        self._places = _flat((now - whole) % self._length)
+        """Where what arrives is in the ring, by where the newest value is."""
         self._ring: np.ndarray | None = None
         self._now = -1
 
     def __call__(self, value: np.ndarray) -> np.ndarray:
         """What arrives in the step in which the value is sent; the first value holds before the start."""
         if self._ring is None:
-            self._ring = np.repeat(value[None], int(self._whole.max()) + 2, axis=0)
-        length = len(self._ring)
-        self._now = (self._now + 1) % length
-        self._ring[self._now] = value
-        near, far = ((self._now - self._whole - more) % length for more in (0, 1))
-        late = np.take_along_axis(self._ring, near[None], axis=0)[0]
-        return late + self._part * (np.take_along_axis(self._ring, far[None], axis=0)[0] - late)
+            self._ring = np.repeat(value[None], self._length, axis=0)
+        self._now = now = (self._now + 1) % self._length
+        self._ring[now] = value
+        late = self._ring.take(self._places[now])
+        return late + self._part * (self._ring.take(self._places[now - 1]) - late)
 
 
 def delayed(history: np.ndarray, k: int, delay: np.ndarray) -> np.ndarray:
@@ -309,9 +311,13 @@ def delayed(history: np.ndarray, k: int, delay: np.ndarray) -> np.ndarray:
     whole = np.floor(delay).astype(int)
     part = delay - whole
     near, far = np.maximum(k - whole, 0), np.maximum(k - whole - 1, 0)
-    return (1 - part) * np.take_along_axis(history, near[None], axis=0)[0] + part * np.take_along_axis(
-        history, far[None], axis=0
-    )[0]
+    return (1 - part) * history.take(_flat(near)) + part * history.take(_flat(far))
+
+
+def _flat(rows: np.ndarray) -> np.ndarray:
+    """Places in a history (T, R, n) of each entry at a row of its own, (..., R, n)."""
+    shape = rows.shape[-2:]
+    return rows * (shape[0] * shape[1]) + np.arange(shape[0] * shape[1]).reshape(shape)
 
 
 def _hermite(value: np.ndarray, slope: np.ndarray, at: np.ndarray, dt: float) -> np.ndarray:

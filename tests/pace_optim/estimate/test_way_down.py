@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from problems import chirp, env_cfg, make_problem, normalised, record
+from problems import TRUTH, chirp, env_cfg, make_problem, normalised, record, replayed
 
 from pace_envs import set_physics_dt
 from pace_optim.estimate.derivatives import colour
@@ -26,7 +26,7 @@ def centre(problem):
 
 
 def test_pieces_are_a_share_of_the_windows_of_each_recording():
-    problem = make_problem([record(chirp(20.0)), record(chirp(3.0))])
+    problem = make_problem([replayed(chirp(seconds), TRUTH, env_cfg()) for seconds in (20.0, 3.0)])
     pieces = problem.on_pieces(0.25).dataset
     own = [sum(recording is each for each in pieces.recordings) for recording in problem.dataset.recordings]
     seconds = problem.dataset.train.sum(dim=0) * problem.control_dt

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from problems import BENCH, TRUTH, chirp, env_cfg, record
+from problems import BENCH, TRUTH, chirp, env_cfg, record, replayed
 
 from pace_optim.problem.problem import load_problem
 from pace_optim.recording import Recording, conform_recording, load_recording, save_recording
@@ -74,7 +74,7 @@ def test_fine_steps_make_a_recording_dear(monkeypatch):
 
 
 def test_parts_of_a_motion_show_the_truth(tmp_path, capsys):
-    path = save_recording(tmp_path / "r.npz", record(chirp(11.0)))
+    path = save_recording(tmp_path / "r.npz", replayed(chirp(11.0), TRUTH, env_cfg()))
     problem = load_problem(BENCH, data=[path], env_cfg=env_cfg(BENCH), max_duration=5.0)
     assert problem.dataset.num_recordings == 1 and "in 1 part of 5 s" in capsys.readouterr().err
     physical = problem.space.from_dict(TRUTH)

@@ -205,6 +205,8 @@ def _replay(dataset, space, x, ratio, delay_mode):
 CHIRP = [run_of(chirp(1.0, amplitude=0.8), session_start=30.0)]
 COARSE = PlantCfg(noise=0.0, step=5e-4)
 COARSE_STEP = ("--physics_dt", "0.0005")
+COARSE_CASES = partial(PlantCfg, step=5e-4)
+"""Of cases whose motions are compared with each other, or with a band of frequencies."""
 
 
 @pytest.fixture(scope="module")
@@ -307,6 +309,7 @@ def test_what_the_plant_cannot_do_is_said(changes, message):
 @pytest.mark.slow
 def test_a_case_is_written_with_its_facts_and_always_the_same(tmp_path, monkeypatch):
     monkeypatch.setattr("pace_optim.data_collection.plant.case.make_suite", partial(make_suite, duration=2.0))
+    monkeypatch.setattr("pace_optim.data_collection.plant.case.PlantCfg", COARSE_CASES)
     case = Case(effects=("torque_ripple",), seed=5)
     files, again = write_case(case, tmp_path / "a"), write_case(case, tmp_path / "b")
     assert len(files.train) == 8 and len(files.validation) == 2
@@ -322,6 +325,7 @@ def test_a_case_is_written_with_its_facts_and_always_the_same(tmp_path, monkeypa
 @pytest.mark.slow
 def test_the_parts_of_a_case_with_a_background_make_up_the_whole(monkeypatch):
     monkeypatch.setattr("pace_optim.data_collection.plant.case.make_suite", partial(make_suite, duration=2.0))
+    monkeypatch.setattr("pace_optim.data_collection.plant.case.PlantCfg", COARSE_CASES)
     case = Case(effects=("torque_gain",), background=0.5, kind="chirp")
     (_, both), (_, main), (_, rest) = (
         make_case(replace(case, part=part)) for part in ("both", "effects", "background")
@@ -337,7 +341,8 @@ def test_the_parts_of_a_case_with_a_background_make_up_the_whole(monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_harmonic_drive_resonates_above_0_db_within_4_to_8_hz():
+def test_the_harmonic_drive_resonates_above_0_db_within_4_to_8_hz(monkeypatch):
+    monkeypatch.setattr("pace_optim.data_collection.plant.case.PlantCfg", COARSE_CASES)
     suite, drawn = make_case(Case(harmonic_drive=True, seed=1))
     small = drawn.recordings[0]
     frequency = 0.1 + 9.9 * small.time / 10.0
@@ -356,7 +361,13 @@ def collect(*args):
         sys.argv = before
 
 
-def test_data_collection_hides_an_effect_and_says_so_beside_the_recording(tmp_path, capsys):
+@pytest.fixture
+def drawn_by_a_second(monkeypatch):
+    """An effect's size is drawn on a second of chirp, in place of six."""
+    monkeypatch.setattr("pace_optim.data_collection.hidden._REFERENCE", 1.0)
+
+
+def test_data_collection_hides_an_effect_and_says_so_beside_the_recording(drawn_by_a_second, tmp_path, capsys):
     path = tmp_path / "r.npz"
     options = ("--task", BENCH, "--duration", "2", "--no_plot", "--noise", "1e-4", "--output", str(path), *COARSE_STEP)
     assert collect(*options, "--effect", "torque_offset", "--seed", "4") == 0
@@ -369,7 +380,7 @@ def test_data_collection_hides_an_effect_and_says_so_beside_the_recording(tmp_pa
     assert load_recording(path).dof_vel is None
 
 
-def test_recordings_made_one_by_one_with_the_same_seed_are_of_one_robot(tmp_path):
+def test_recordings_made_one_by_one_with_the_same_seed_are_of_one_robot(drawn_by_a_second, tmp_path):
     truths = []
     for motion in ("steps", "multisine"):
         options = ("--task", BENCH, "--duration", "2", "--no_plot", "--excitation", motion, "--seed", "3", *COARSE_STEP)
@@ -379,7 +390,7 @@ def test_recordings_made_one_by_one_with_the_same_seed_are_of_one_robot(tmp_path
     assert truths[0] == truths[1]
 
 
-def test_data_collection_with_a_battery_writes_every_recording(tmp_path):
+def test_data_collection_with_a_battery_writes_every_recording(drawn_by_a_second, tmp_path):
     options = ("--task", BENCH, "--duration", "0.5", "--no_plot", "--excitation", "battery", *COARSE_STEP)
     assert collect(*options, "--effect", "torque_gain", "--output", str(tmp_path / "b.npz")) == 0
     assert len(list(tmp_path.glob("b_*.npz"))) == 6 and (tmp_path / "b.truth.json").is_file()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from diagnoses import joint_alone
-from problems import BENCH, CALM, TRUTH, chirp, make_problem, physical, record
+from problems import BENCH, CALM, TRUTH, chirp, env_cfg, make_problem, physical, record, replayed
 from run_folders import make_result
 
 from pace_actuators import IdentifiedDrives
@@ -52,7 +52,7 @@ def test_the_end_is_told_as_a_multiple_of_the_noise_with_what_to_do():
 
 
 def test_the_noise_is_that_of_the_recordings():
-    recording = record(chirp(3.0), CALM)
+    recording = replayed(chirp(3.0), CALM, env_cfg())
     noisy = replace(
         recording, dof_pos=recording.dof_pos + np.random.default_rng(0).normal(0, 1e-3, (len(recording.time), 1))
     )
