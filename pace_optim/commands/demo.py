@@ -16,6 +16,7 @@ from pace_optim.run.settings import FitSettings
 from pace_optim.run.summary import summary
 from pace_optim.terminal.cli import make_parser
 from pace_optim.terminal.options import add_overwrite_option, number
+from pace_optim.terminal.progress import ProgressLine
 
 TASK = "Pace-AnymalD-v0"
 NOISE = 1e-4  # [rad]
@@ -62,6 +63,8 @@ def main() -> None:
     torch.set_num_threads(1)  # the physics takes the cores; the tensors are small
 
     print(f"1. Record: a simulated ANYmal D whose {args.effect_joints} have {args.effect}.", flush=True)
+    progress = ProgressLine()
+    progress.wait_for("simulating the recordings")
     files = record(
         args.effect,
         args.effect_joints,
@@ -70,6 +73,7 @@ def main() -> None:
         args.log_dir,
         args.overwrite or args.log_dir == LOG_DIR,
     )
+    progress.close()
     print("2. Fit the base model, which does not have it.", flush=True)
     result, base = fit(
         FitSettings(

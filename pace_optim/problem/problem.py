@@ -358,9 +358,11 @@ class Facts:
         for drive in cfg.scene.robot.actuators.values():
             drive.delay_mode = delay_mode or drive.delay_mode  # type: ignore[assignment]
             if drive.largest_delay < longest:
+                step = 1e3 * cfg.sim.dt * cfg.decimation
                 raise ValueError(
-                    f"The delay's upper bound is {longest:g} control steps, but the drive allows max_delay = "
-                    f"{drive.largest_delay:g}. Raise max_delay in the robot's PaceDCMotorCfg or lower the bound."
+                    f"The delay's upper bound is {longest * step:g} ms ({longest:g} control steps), but the drive "
+                    f"allows {drive.largest_delay * step:g} ms (max_delay = {drive.largest_delay:g}). Raise max_delay "
+                    "in the robot's PaceDCMotorCfg or lower the bound."
                 )
         if drive_dt is not None:
             _set_drive_dt(cfg, drive_dt)

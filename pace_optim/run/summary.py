@@ -29,10 +29,9 @@ def summary(result: FitResult) -> list[str]:
     lines += _links(result)
     for name, values in result.parameters.items():
         if set(values) == {ALL}:
-            text = f"{name}: {_value(result, name, 'all')} {result.unit_of(name, 'all')}"
+            lines.append(f"{name}: {_value(result, name, 'all')} {result.unit_of(name, 'all')}")
             if name == "delay":
-                text += f" = {1e3 * result.delay_s:.3f} ms, delay mode {result.delay_mode}"
-            lines.append(text)
+                lines[-1] = _delay(result)
     if result.step_error:
         rate = " and the assumed loop rate" if result.assumes_loop_rate else ""
         step = f"the physics step of {1e3 * result.physics_dt:g} ms"
@@ -130,15 +129,22 @@ def _links(result: FitResult) -> list[str]:
     return [*lines, ""]
 
 
-def _value(result: FitResult, name: str, key: str) -> str:
+def _delay(result: FitResult) -> str:
+    """The delay in ms and in control steps."""
+    step, mode = 1e3 * result.control_dt, f"delay mode {result.delay_mode}"
+    steps = f"{result.parameters['delay'][ALL]:.4g} control steps of {step:g} ms"
+    return f"delay: {_value(result, 'delay', ALL, step)} ms ({steps}), {mode}"
+
+
+def _value(result: FitResult, name: str, key: str, factor: float = 1.0) -> str:
     if key not in result.parameters[name]:  # an effect that other joints have
         return "-"
     std = result.std[name][key]
     label = f"{name}/{key}"
     mark = " (at bound)" if label in result.at_bound else " (prior)" if label in result.undetermined else ""
     means_nothing = result.std_means_nothing and result.has_error_bar(name, key)
-    error = " ± ?" if means_nothing else "" if std is None else f" ± {std:.1g}"
-    return f"{result.parameters[name][key]:.5g}{error}{mark}"
+    error = " ± ?" if means_nothing else "" if std is None else f" ± {factor * std:.1g}"
+    return f"{factor * result.parameters[name][key]:.5g}{error}{mark}"
 
 
 def errors_of(result: FitResult, key: str) -> str:

@@ -199,7 +199,6 @@ def summary_of(found: Findings, problem: Problem) -> str:
     """The verdict in a few sentences."""
     unit = units_for("mrad", problem.joint_types)
     before = 1e3 * float(found.outcome.base_errors.mse.mean().sqrt())
-    after = 1e3 * float(found.outcome.final_errors.mse.mean().sqrt())
     alone = "" if len(problem.joint_names) == 1 else ", with each joint simulated alone"
     floor = 1e3 * float(found.data.floor.square().mean().sqrt())
     if found.verdict == "nothing_missing":
@@ -218,12 +217,15 @@ def summary_of(found: Findings, problem: Problem) -> str:
             text += f" {what}, {', '.join(found.paying)}, explains {part:.0f} % of what lies between."
         return " ".join([text, *hint_sentences(found.hints, problem.joint_names)])
     what = "all of it" if found.free_form else "it"
+    far = found.outcome.far(found.data.floor).tolist()
+    part = "over 99" if any(far) and found.explained > 0.99 else f"{100 * found.explained:.0f}"
     summary = (
-        f"{_missing(found)} On held-out recordings {what} explains {100 * found.explained:.0f} % of what lies above "
-        f"the floor ({floor:.3g} {unit})."
+        f"{_missing(found)} On held-out recordings {what} explains {part} % of what lies above the floor "
+        f"({floor:.3g} {unit})."
     )
-    if after > found.outcome.cfg.judging.far * floor and not found.free_form:
-        summary += " Something else is missing too, which no known effect explains."
+    if any(far) and not found.free_form:
+        where = conjoined(name for name, is_far in zip(problem.joint_names, far, strict=True) if is_far)
+        summary += f" Something else is missing on {where} too, which no known effect explains."
     return " ".join([summary, *hint_sentences(found.hints, problem.joint_names)])
 
 

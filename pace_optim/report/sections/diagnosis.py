@@ -13,7 +13,7 @@ from pace_actuators.text import in_words, listed, sizes_by_joints, three_figures
 
 from ..markup import Section, bold, bullets, figure, html, joined, table
 from ..run_data import RunData
-from .verdict import callout
+from .verdict import callout, headline
 
 _SHOWN = 10
 """Effects in the chart, at most."""
@@ -28,7 +28,7 @@ def diagnosis(run: RunData) -> Section | None:
     if not content:
         return None
     parts = [
-        callout(content, run.result),
+        callout(run, content, heading=headline(run)),
         _sizes(content),
         _ladder(content),
         _error_map(content),
@@ -36,7 +36,7 @@ def diagnosis(run: RunData) -> Section | None:
         _joints(content),
     ]
     parts += [_advice(content), _data(content)]
-    return Section(id="diagnosis", title="Which effect is missing", html=joined(parts))
+    return Section(id="diagnosis", title="Diagnosis", html=joined(parts))
 
 
 def _floor(content: dict[str, Any]) -> float:
