@@ -141,7 +141,7 @@ def _chart(entries: list[dict[str, Any]], floor: float, factor: float, unit: str
         "xaxis": {"title": {"text": f"validation error [{unit}]"}, "rangemode": "tozero"},
         "yaxis": {"type": "category", "automargin": True, "showgrid": False},
         "hovermode": "closest",
-        "legend": {"traceorder": "reversed"},
+        "legend": {"traceorder": "reversed", "orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom"},
     }
     return figure("effect-ranking", [floor_line, *traces], layout, height=130 + 42 * len(names))
 
@@ -189,17 +189,17 @@ def _error_map(content: dict[str, Any]) -> Markup:
     joints = {name: each for name, each in content.get("error_map", {}).items() if "explained" in each}
     if not joints:
         return Markup("")
-    curves = list(next(iter(joints.values()))["explained"])
+    parts = {name: joint["explained"] for name, joint in joints.items()}
+    curves = sorted(next(iter(parts.values())), key=lambda curve: -max(own[curve] for own in parts.values()))
     rows = [
-        [bold(name), *(f"{100 * max(0.0, joint['explained'][curve]):.0f} %" for curve in curves)]
-        for name, joint in joints.items()
+        [bold(in_words(curve)), *(f"{100 * max(0.0, own[curve]):.0f} %" for own in parts.values())] for curve in curves
     ]
     said = bullets([f"{name}: {joint['sentence']}" for name, joint in joints.items()], "notes")
     about = (
         "part of the squared error above the floor that a curve of any form explains by itself, "
         "on top of the base model"
     )
-    shown = table(["joint", *(in_words(curve) for curve in curves)], rows)
+    shown = table(["curve", *joints], rows)
     return _titled("What carries the error", said + _curve(content, joints) + shown, about)
 
 

@@ -115,7 +115,7 @@ def _worst_joint(result: FitResult) -> tuple[str, float]:
 
 
 def _times(ratio: float) -> str:
-    return "0.1 times that or less in" if ratio < 0.1 else f"{ratio:.3g} times that in"
+    return "below 0.1" if ratio < 0.1 else f"{ratio:.3g}"
 
 
 _PARTS = ("train", "validation")
@@ -141,8 +141,8 @@ def _figures(result: FitResult) -> Markup:
     if result.times_noise and train:
         noise = train / result.times_noise
         parts = [("training", train), ("validation", held_out)]
-        times = [f"{_times(error / noise)} {part}" for part, error in parts if error is not None]
-        figures.insert(2, ("Noise", said(noise), f"the error is {' and '.join(times)}"))
+        times = [f"{_times(error / noise)} × in {part}" for part, error in parts if error is not None]
+        figures.insert(2, ("Noise", said(noise), f"the error is {', '.join(times)}"))
     if result.objective:
         own, kept = ("–" if part is None else f"{part:.2e}" for part in map(result.objective.get, _PARTS))
         figures.insert(-1, ("Objective", own, f"in training, {kept} in validation"))

@@ -63,7 +63,9 @@ def _heading(run: RunData, content: dict[str, Any]) -> tuple[str, str]:
         return "good", "Nothing is missing"
     found = conjoined(_found(content))
     if not found:
-        return "bad", "Something is missing, and no known effect explains it"
+        curves = set(content.get("free_form", []))
+        part = "all of it" if set(content.get("paying", [])) - curves else "it"
+        return "bad", f"Something is missing, and no known effect explains {part}"
     joints = _unexplained(content)
     if joints or content["verdict"] == "unknown":
         where = f" on {listed(joints, _SHOWN)}" if joints else ""

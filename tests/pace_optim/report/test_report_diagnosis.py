@@ -53,6 +53,7 @@ def test_the_run_with_what_was_missing_is_not_told_to_add_it(tmp_path):
     assert "Add it" not in text
 
 
+CURVE = "torque_over_position@hip"
 MORE = {"joints": {**make_diagnosis()["joints"], "hip": {**make_diagnosis()["joints"]["hip"], "floor": 1e-5}}}
 """The hip ends far from its floor."""
 
@@ -69,9 +70,14 @@ MORE = {"joints": {**make_diagnosis()["joints"], "hip": {**make_diagnosis()["joi
             "In this run: Stribeck friction at hip, knee, ankle. More is missing: the error is 40 times the noise",
         ),
         (
-            {"added": [], "verdict": "unknown", "paying": ["torque_over_position@hip"]},
+            {"added": [], "verdict": "unknown", "paying": [CURVE], "free_form": [CURVE]},
             {},
             "Something is missing, and no known effect explains it",
+        ),
+        (
+            {"added": [], "verdict": "unknown", "paying": ["stribeck_friction", CURVE], "free_form": [CURVE]},
+            {},
+            "Something is missing, and no known effect explains all of it",
         ),
         (
             {"added": [], "verdict": "nothing_missing"},

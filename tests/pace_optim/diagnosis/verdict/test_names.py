@@ -352,4 +352,4 @@ def test_it_is_fitted_to_the_whole_robot_all_the_same(run, bench, monkeypatch, s
     page = write_report(run.folder).read_text("utf-8")
     advice = "this lowers the error: <code>scripts/fit.py … --effects parallel_spring</code>"
     assert (advice in page) is broken_off  # a refit has it
-    assert "<h1>Something is missing, and no known effect explains it</h1>" in page
+    assert "<h1>Something is missing, and no known effect explains all of it</h1>" in page
