@@ -75,8 +75,8 @@ def _heading(run: RunData, content: dict[str, Any]) -> tuple[str, str]:
         if left:
             return "bad", f"In this run: {found}. More is missing: the error is {left}"
         return "good", f"What was missing is in this run: {found}"
-    begin = "Missing" if content["added"] else "Wrong in the model file"
-    return "good", f"{begin}{' in this run' if _other_run(run, content) else ''}: {found}"
+    begin, this = ("Missing", " in this run") if content["added"] else ("Wrong in the model file", " of this run")
+    return "good", f"{begin}{this if _other_run(run, content) else ''}: {found}"
 
 
 def _found(content: dict[str, Any]) -> list[str]:

@@ -42,13 +42,13 @@ def test_it_says_what_is_missing_and_on_what_evidence(tmp_path):
 def test_the_run_with_what_was_missing_is_not_told_to_add_it(tmp_path):
     with_it = folder_with(tmp_path / "with", make_diagnosis())
     make_result(effects=["stribeck_friction"]).save(with_it / "result.json")
-    without = page_of(folder_with(tmp_path / "without", make_diagnosis())).text
+    without = page_of(folder_with(tmp_path / "alone" / "run", make_diagnosis())).text
     assert "Add it" in without and "This run is the fit with it." not in without
     text = page_of(with_it).text
     assert "This run is the fit with it." in text and "What was missing is in this run" in text
     assert "Add it" not in text and "Missing:" not in text
-    # the report of the diagnosed run, made anew, names the run beside it
-    text = page_of(tmp_path / "without").text
+    # the report of a diagnosed run names the run beside it
+    text = page_of(folder_with(tmp_path / "without", make_diagnosis())).text
     assert "Missing in this run: Stribeck friction" in text and "The run with it: with" in text
     assert "Add it" not in text
 
@@ -100,7 +100,7 @@ def test_the_run_with_a_wrong_link_is_not_told_to_add_it(tmp_path):
     mass = {"parameter": "link_mass", "unit": "kg", "file": 0.5, "found": 0.8, "std": 0.01}
     wrong = [{"link": "shank", "parts": ["mass"], "values": [mass], "label": "shank@mass"}]
     told = make_diagnosis("link") | {"added": [], "paying": [], "links": wrong}
-    without, with_it = (folder_with(tmp_path / name, told) for name in ("without", "with"))
+    without, with_it = (folder_with(tmp_path / name, told) for name in ("alone/without", "with"))
     result = make_result()
     link = {"parameters": {"shank": 0.8}, "std": {"shank": 0.01}, "units": "kg"}
     result = replace(result, **{name: {**getattr(result, name), "link_mass": value} for name, value in link.items()})
