@@ -37,6 +37,8 @@ def summary(result: FitResult) -> list[str]:
         step = f"the physics step of {1e3 * result.physics_dt:g} ms"
         lines.append(f"±: one standard deviation, which includes noise, {step}{rate}")
     lines.append(f"{error_line(result)}; {units_for(f'score {result.score:.3e} rad²', result.joint_types)}")
+    if result.times_noise and not result.std_means_nothing:
+        lines.append(f"training error: {result.times_noise:.3g} times the measurement noise")
     if result.torque_noise:
         lines.append(f"error of torques: {', '.join(_torque_errors(result))} (train / validation)")
     if result.objective:

@@ -13,7 +13,6 @@ from pace_actuators.text import in_words, listed, sizes_by_joints, three_figures
 
 from ..markup import Section, bold, bullets, figure, html, joined, table
 from ..run_data import RunData
-from .verdict import callout, headline
 
 _SHOWN = 10
 """Effects in the chart, at most."""
@@ -28,7 +27,6 @@ def diagnosis(run: RunData) -> Section | None:
     if not content:
         return None
     parts = [
-        callout(run, content, heading=headline(run)),
         _sizes(content),
         _ladder(content),
         _error_map(content),
@@ -65,8 +63,11 @@ def _sizes(content: dict[str, Any]) -> Markup:
         [bold(effect), parameter.replace("_", " "), listed(joints), text, ", ".join(likes.get(effect, [])) or "–"]
         for (effect, parameter, text), joints in sizes.items()
     ]
-    head = ["effect", "parameter", "joints", "size ± standard deviation", "cannot be separated from"]
-    return _titled("How large it is", table(head, rows))
+    known = any(size["std"] is not None for size in content["sizes"])
+    size = "size ± standard deviation" if known else "size"
+    about = "" if known else "without error bars: these joints end above their floor, or a value is at its bound"
+    head = ["effect", "parameter", "joints", size, "cannot be separated from"]
+    return _titled("How large it is", table(head, rows), about)
 
 
 def _ladder(content: dict[str, Any]) -> Markup:
@@ -149,7 +150,7 @@ def _chart(entries: list[dict[str, Any]], floor: float, factor: float, unit: str
 def _evidence(entries: list[dict[str, Any]], factor: float, unit: str) -> Markup:
     rows = []
     for entry in entries:
-        state = "added" if entry.get("added") else "pays" if entry["significant"] else "does not pay"
+        state = "added" if entry.get("added") else "would pay" if entry["significant"] else "does not pay"
         rows.append(
             [
                 bold(_name(entry)),

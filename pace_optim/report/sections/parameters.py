@@ -15,6 +15,13 @@ from ..run_data import RunData
 
 _CONFIDENCE = 1.96
 """Standard deviations on either side that hold the value with 95 % probability."""
+_BARS = (
+    "Bars span 1.96 standard deviations to either side (95 %). They include noise, the residuals' correlation in time, "
+    "the physics step and an assumed loop rate. They do not include physics that the model lacks."
+)
+_FAR = (
+    "The fit ended far above the noise, so the values have no error bars: physics that the model lacks counts for more."
+)
 _WIDTH, _HEIGHT, _INSET = 360, 20, 6
 
 
@@ -39,8 +46,7 @@ def parameters(run: RunData) -> Section:
     return Section(
         id="parameters",
         title="Parameters",
-        lead="Bars span 1.96 standard deviations to either side (95 %). They include noise, the residuals' correlation "
-        "in time, the physics step and an assumed loop rate. They do not include physics that the model lacks.",
+        lead=_FAR if result.std_means_nothing else _BARS,
         html=html('<div class="cards">{{ cards }}</div>', cards=joined(cards)),
     )
 

@@ -43,7 +43,7 @@ def _in_short(run: RunData) -> Markup:
         f"{effect} cannot be separated from {', '.join(likes)}" for effect, likes in content.get("likes", {}).items()
     ]
     link = html('<p><a href="#diagnosis">What was tried, and the evidence</a></p>')
-    return callout(run, content, joined([bullets(said, "notes"), link] if said else [link]))
+    return _callout(run, content, joined([bullets(said, "notes"), link] if said else [link]))
 
 
 def headline(run: RunData) -> str:
@@ -108,19 +108,18 @@ def _has_it(fit: FitResult, content: dict[str, Any]) -> bool:
     return bool(effects or links) and set(effects) <= set(fit.effects) and found <= sought
 
 
-def callout(run: RunData, content: dict[str, Any], more: Markup | str = "", heading: str = "") -> Markup:
+def _callout(run: RunData, content: dict[str, Any], more: Markup) -> Markup:
     """What is missing, and the run that has it, or how to add it to a run."""
     effects = content.get("paying") or content["added"]
     links = [link["label"] for link in content.get("links", [])]
     other = _other_run(run, content)
     return html(
-        '<div class="callout {{ css }}">{% if heading %}<h3>{{ heading }}</h3>{% endif %}<p>{{ summary }}</p>'
+        '<div class="callout {{ css }}"><p>{{ summary }}</p>'
         "{% if has_it %}<p>This run is the fit with it.</p>{% elif (effects or links) and not other %}<p>{{ why }}: "
         "<code>{{ command }} …{% if effects %} --effects {{ effects }}{% endif %}{% if links %} --links {{ links }}"
         '{% endif %}</code></p>{% endif %}{% if other %}<p>{{ "The run without it" if has_it else "The run with it" }}:'
-        ' <a href="{{ other }}/report.html">{{ other.name }}</a></p>{% endif %}{{ more }}</div>',
+        ' <b><a href="{{ other }}/report.html">{{ other.name }}</a></b></p>{% endif %}{{ more }}</div>',
         css=_heading(run, content)[0],
-        heading=heading,
         summary=content["summary"],
         has_it=_has_it(run.result, content),
         effects=shlex.join(dict.fromkeys([*run.result.effects, *effects])),

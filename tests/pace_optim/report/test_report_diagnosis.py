@@ -91,7 +91,7 @@ def test_the_headline_never_claims_more_than_the_verdict(tmp_path, content, run,
     folder = folder_with(tmp_path / "run", make_diagnosis() | content)
     make_result(**run).save(folder / "result.json")
     text = page_of(folder).text
-    assert text.count(headline) == 2  # on top, and over the evidence
+    assert text.count(headline) == 1
     good = headline.startswith(("What was", "Missing: ")) and "More" not in headline
     assert ('class="callout bad"' not in write_report(folder).read_text("utf-8").partition("Error of each")[0]) == good
 
