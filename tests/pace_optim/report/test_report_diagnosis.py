@@ -46,7 +46,7 @@ def test_the_run_with_what_was_missing_is_not_told_to_add_it(tmp_path):
     assert "Add it" in without and "This run is the fit with it." not in without
     text = page_of(with_it).text
     assert "This run is the fit with it." in text and "What was missing is in this run" in text
-    assert "Add it" not in text and "Missing:" not in text
+    assert "Add it" not in text and "Missing in this run" not in text
     # the report of a diagnosed run names the run beside it
     text = page_of(folder_with(tmp_path / "without", make_diagnosis())).text
     assert "Missing in this run: Stribeck friction" in text and "The run with it: with" in text
