@@ -270,23 +270,23 @@ def step_notes(cfg: PaceDCMotorCfg, physics_dt: float | None) -> list[str]:
         return []
     notes, at, control_dt = [], cfg.identified, physics_dt * cfg.control_decimation
     if cfg.delay_s is not None:
-        steps, delay = delay_in_steps(cfg, physics_dt)[0], f"{1e3 * cfg.delay_s:.3g} ms"
+        steps, step = delay_in_steps(cfg, physics_dt)[0], f"{1e3 * control_dt:g} ms"
+        delay = f"The delay of {1e3 * cfg.delay_s:.3g} ms ({steps:.3g} control steps of {step})"
         whole = abs(steps - round(steps)) < 1e-6
         if cfg.delay_interpolation == "hold" and not whole:
             notes.append(
-                f"The delay of {delay} is {steps:.3g} control steps, and delay_interpolation 'hold' makes it "
-                f"{math.ceil(steps)} ({1e3 * math.ceil(steps) * control_dt:.3g} ms)."
+                f"{delay} becomes {1e3 * math.ceil(steps) * control_dt:.3g} ms: with delay_interpolation 'hold' it is "
+                "a whole number of them."
             )
         elif not whole and control_dt > at.control_dt * (1 + 1e-6):
             notes.append(
-                f"The delay of {delay} is {steps:.3g} control steps of {1e3 * control_dt:g} ms. Between steps it is a "
-                f"linear mix of two samples, which smooths more than at the {1e3 * at.control_dt:g} ms of the "
-                "identification. Train at that step for the identified delay."
+                f"{delay} lies between two steps. It is a linear mix of two samples there, which smooths more than at "
+                f"the {1e3 * at.control_dt:g} ms of the identification. Train at that step for the identified delay."
             )
         if steps > cfg.largest_delay:
             notes.append(
-                f"The delay of {delay} is {steps:.3g} control steps, more than max_delay = {cfg.largest_delay:g}: "
-                f"it was raised to {math.ceil(steps)}."
+                f"{delay} is longer than max_delay, {1e3 * cfg.largest_delay * control_dt:.3g} ms: max_delay was "
+                f"raised to {math.ceil(steps)} steps."
             )
     ratio = max(physics_dt / at.physics_dt, at.physics_dt / physics_dt)
     if ratio > _FARTHEST * (1 + 1e-6):

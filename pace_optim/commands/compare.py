@@ -15,6 +15,7 @@ from pace_optim.terminal.options import (
     number,
     take_common_options,
 )
+from pace_optim.terminal.progress import ProgressLine
 
 
 def main() -> None:
@@ -34,6 +35,8 @@ def main() -> None:
     options = take_common_options(vars(parser.parse_args()))
 
     torch.set_num_threads(1)  # the physics takes the cores; the tensors are small
+    progress = ProgressLine()
+    progress.wait_for("simulating the recordings, and looking for where the error lies")
     content = compare(
         options["runs"],
         options["data"],
@@ -43,6 +46,7 @@ def main() -> None:
         options["strict"],
         options["device"] or "cpu",
     )
+    progress.close()
     print(*comparison_lines(content), sep="\n")
     run = Path(content["run"])
     print(f"report: {run / 'report.html'}")

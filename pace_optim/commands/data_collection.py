@@ -13,9 +13,11 @@ def main() -> None:
     """Parse the command line, make what is asked for, print where it is."""
     torch.set_num_threads(1)  # the physics takes the cores; the tensors are small
     progress = ProgressLine()
-    collection = collect(cfg_from_args(make_collection_parser().parse_args()), progress.say)
+    cfg = cfg_from_args(make_collection_parser().parse_args())
+    progress.wait_for("simulating the recordings")
+    collection = collect(cfg, progress.say)
+    progress.close()
     if collection.design is not None:
-        progress.close()
         print(*design_table(collection.design), sep="\n")
     for warning in collection.warnings:
         print(f"warning: {warning}", file=sys.stderr)

@@ -1,6 +1,7 @@
 """The whole way on ANYmal D with a hidden effect: record, fit, compare, diagnose, add what is missing, fit again."""
 
 import json
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from pace_optim.run.settings import FitSettings
 from pace_optim.run.summary import summary
 from pace_optim.terminal.cli import make_parser
 from pace_optim.terminal.options import add_overwrite_option, number
+from pace_optim.terminal.progress import ProgressLine
 
 TASK = "Pace-AnymalD-v0"
 NOISE = 1e-4  # [rad]
@@ -49,6 +51,15 @@ def record(effect: str, joints: str, duration: float, seed: int, folder: Path, o
     return {part: [str(made[motion].recordings[0]) for motion in motions] for part, motions in MOTIONS.items()}
 
 
+def _compared(runs: Sequence[str | Path], progress: ProgressLine) -> list[str]:
+    """The comparison of runs with their recordings, as lines."""
+    progress.restart()
+    progress.wait_for("simulating the recordings")
+    lines = comparison_lines(compare(runs))
+    progress.close()
+    return lines
+
+
 def main() -> None:
     """Run and print the five steps."""
     parser = make_parser(__doc__, example="scripts/demo.py --effect backlash --effect_joints '.*KFE'")
@@ -62,6 +73,8 @@ def main() -> None:
     torch.set_num_threads(1)  # the physics takes the cores; the tensors are small
 
     print(f"1. Record: a simulated ANYmal D whose {args.effect_joints} have {args.effect}.", flush=True)
+    progress = ProgressLine()
+    progress.wait_for("simulating the recordings")
     files = record(
         args.effect,
         args.effect_joints,
@@ -70,7 +83,10 @@ def main() -> None:
         args.log_dir,
         args.overwrite or args.log_dir == LOG_DIR,
     )
+    progress.close()
     print("2. Fit the base model, which does not have it.", flush=True)
+    progress.restart()
+    progress.wait_for("reading the recordings")
     result, base = fit(
         FitSettings(
             task=TASK,
@@ -80,11 +96,12 @@ def main() -> None:
             physics_dt=PHYSICS_DT,
             check_consistency=False,  # the story is another
             log_dir=str(args.log_dir),
-        )
+        ),
+        progress,
     )
     print(*summary(result), sep="\n")
     print("", "3. Compare: where does it fail?", sep="\n", flush=True)
-    print(*comparison_lines(compare([base])), sep="\n")
+    print(*_compared([base], progress), sep="\n")
     print("", "4. Diagnose: which effect is missing?", sep="\n", flush=True)
     diagnosis = diagnose(DiagnosisSettings(run=base, max_effects=2))
     print(diagnosis.summary)
@@ -92,7 +109,7 @@ def main() -> None:
     print("", f"The truth: {', '.join(hidden)} on {args.effect_joints}.", sep="\n")
     if len(diagnosis.runs) > 1:
         print("", "5. The ladder of the error, from the base model to the last effect:", sep="\n", flush=True)
-        print(*comparison_lines(compare(diagnosis.runs)), sep="\n")
+        print(*_compared(diagnosis.runs, progress), sep="\n")
     for run in diagnosis.runs:
         print(f"report: {write_report(run)}")
     print(f"run: {diagnosis.runs[-1]}")

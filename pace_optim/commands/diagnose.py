@@ -60,6 +60,8 @@ def run_and_tell(settings: DiagnosisSettings) -> None:
     """Diagnose; print the verdict before the robot is fitted again, then the sizes, that fit with its verdict."""
     diagnosis = diagnose(settings, on_verdict=lambda found: print(*lines_of(found), sep="\n", flush=True))
     first, last = Path(diagnosis.runs[0]), Path(diagnosis.runs[-1])
+    if not first.is_absolute() and last.is_relative_to(Path.cwd()):  # as the run was named
+        last = last.relative_to(Path.cwd())
     lines = size_lines(diagnosis.sizes)
     if first != last:
         with_what = [*(link["link"] for link in diagnosis.links), *diagnosis.paying]

@@ -24,7 +24,8 @@ from .tracks import RunTracks, Track, load_tracks
 
 VERSION = 1
 FILE = "comparison.json"
-_DIGITS = 5
+_DIGITS = 8
+"""Figures in the file: with fewer, three of them may be rounded to another number than the same error elsewhere."""
 _UNREPEATABLE = 3.0
 """Repetitions that differ by this many times the noise that each shows by itself are not of the same robot."""
 

@@ -56,7 +56,7 @@ class Place:
     @property
     def sentence(self) -> str:
         """For a person."""
-        of = "of the octaves" if self.by == ("frequency",) else "of the time"
+        of = "of the band, in octaves" if self.by == ("frequency",) else "of the time"
         return (
             f"{self.joint}: {percent(self.share)} of the remaining error lies {self.text} ({percent(self.base)} {of})."
         )

@@ -174,7 +174,10 @@ def effect_notes(drives: IdentifiedDrives, held: Sequence[str]) -> list[str]:
         elif kind.name in held:
             notes.append(f"{kind.name}: in the file.")
         else:
-            notes.append(f"{kind.name} ({_what(kind)}): omitted. The robot moves differently without it.")
+            notes.append(
+                f"{kind.name} ({_what(kind)}): omitted. The robot moves differently without it. PaceDCMotor has it, in "
+                "any simulator (--format mjcf --joints_only)."
+            )
     return notes
 
 

@@ -57,6 +57,7 @@ from pace_optim.terminal.choices import DELAY_MODES
 
 _SHORTER = 0.95
 """Commands that come at this part of a control step, or faster, are faster."""
+_NO_GAINS, _STATED_GAINS = "gains: the file has none", "gains: those that the recordings state"
 
 
 @dataclass(kw_only=True, eq=False)
@@ -358,9 +359,11 @@ class Facts:
         for drive in cfg.scene.robot.actuators.values():
             drive.delay_mode = delay_mode or drive.delay_mode  # type: ignore[assignment]
             if drive.largest_delay < longest:
+                step = 1e3 * cfg.sim.dt * cfg.decimation
                 raise ValueError(
-                    f"The delay's upper bound is {longest:g} control steps, but the drive allows max_delay = "
-                    f"{drive.largest_delay:g}. Raise max_delay in the robot's PaceDCMotorCfg or lower the bound."
+                    f"The delay's upper bound is {longest * step:g} ms ({longest:g} control steps), but the drive "
+                    f"allows {drive.largest_delay * step:g} ms (max_delay = {drive.largest_delay:g}). Raise max_delay "
+                    "in the robot's PaceDCMotorCfg or lower the bound."
                 )
         if drive_dt is not None:
             _set_drive_dt(cfg, drive_dt)
@@ -392,11 +395,13 @@ class Facts:
                 motors=self.motors,
             )
             facts = replace(facts, logged_rate=True)
-        if not logs.held and not logs.note:
+        gains = [note for note in facts.cfg.sim2real.notes if note.startswith(_NO_GAINS) and logs.state_gains]
+        if not logs.held and not logs.note and not gains:
             return facts
         cfg = copy.deepcopy(facts.cfg).holding(logs.held)
         cfg.prepare()
-        cfg.sim2real.notes = (*cfg.sim2real.notes, *filter(None, [logs.note]))
+        said = (_STATED_GAINS if note in gains else note for note in cfg.sim2real.notes)
+        cfg.sim2real.notes = (*said, *filter(None, [logs.note]))
         return replace(facts, cfg=cfg)
 
     def make_env(self) -> ManagerBasedRLEnv:
@@ -589,6 +594,8 @@ def _set_drive_dt(cfg: PaceSim2realEnvCfg, drive_dt: float) -> None:
     """Set the period of all drives' loops [s]; 0: they run continuously."""
     for drive in cfg.scene.robot.actuators.values():
         drive.drive_dt, drive.implicit = drive_dt or None, drive_dt == 0
+    said = f"drive loops: they run {f'every {1e3 * drive_dt:g} ms' if drive_dt else 'continuously'}, by --drive_dt"
+    cfg.sim2real.notes = tuple(said if note.startswith("drive loops: ") else note for note in cfg.sim2real.notes)
 
 
 def _read_torques(

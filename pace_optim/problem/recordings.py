@@ -53,6 +53,12 @@ class Logs:
     """What is to be said of them."""
 
     @property
+    def state_gains(self) -> bool:
+        """Whether each states the gains of all its joints."""
+        gains = [each.drive.stiffness for group in self.groups for each in group]
+        return bool(gains) and all(gain is not None and bool(np.isfinite(gain).all()) for gain in gains)
+
+    @property
     def command_dt(self) -> float:
         """Shortest time from one command to the next in any of them [s]; infinite where nothing is commanded."""
         every = [each for group in self.groups for each in group if each.is_commanded.any() and each.num_samples > 2]

@@ -249,7 +249,7 @@ _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 
 
 def notes_by_kind(recordings: Sequence[Recording]) -> list[str]:
-    """Notes with the recordings that have them; those that differ in numbers alone come once, of the first.
+    """Notes with the recordings that have them; of those that differ in numbers alone, others show these numbers.
 
     Args:
         recordings: In the order of the notes.
@@ -264,7 +264,14 @@ def notes_by_kind(recordings: Sequence[Recording]) -> list[str]:
         if len({text for _, text in told}) == 1:
             result.append(f"{listed(names, 6)}: {note}")
         else:
-            others = [name for name in names if name != first]
-            more = f" ({listed(others, 5)}: the same with other numbers.)" if others else ""
+            others = {name: text for name, text in told if name != first and text != note}
+            numbers = [f"{name}: {', '.join(_other_numbers(note, text))}" for name, text in others.items()]
+            more = f" ({listed(numbers, 3)})" if numbers else ""
             result.append(f"{first}: {note}{more}")
     return result
+
+
+def _other_numbers(note: str, other: str) -> list[str]:
+    """The numbers of a note that differ from those of another."""
+    pairs = zip(_NUMBER.findall(note), _NUMBER.findall(other), strict=True)
+    return [second for first, second in pairs if second != first]

@@ -29,15 +29,16 @@ def summary(result: FitResult) -> list[str]:
     lines += _links(result)
     for name, values in result.parameters.items():
         if set(values) == {ALL}:
-            text = f"{name}: {_value(result, name, 'all')} {result.unit_of(name, 'all')}"
+            lines.append(f"{name}: {_value(result, name, 'all')} {result.unit_of(name, 'all')}")
             if name == "delay":
-                text += f" = {1e3 * result.delay_s:.3f} ms, delay mode {result.delay_mode}"
-            lines.append(text)
+                lines[-1] = _delay(result)
     if result.step_error:
         rate = " and the assumed loop rate" if result.assumes_loop_rate else ""
         step = f"the physics step of {1e3 * result.physics_dt:g} ms"
         lines.append(f"±: one standard deviation, which includes noise, {step}{rate}")
     lines.append(f"{error_line(result)}; {units_for(f'score {result.score:.3e} rad²', result.joint_types)}")
+    if result.times_noise and not result.std_means_nothing:
+        lines.append(f"training error: {result.times_noise:.3g} times the measurement noise")
     if result.torque_noise:
         lines.append(f"error of torques: {', '.join(_torque_errors(result))} (train / validation)")
     if result.objective:
@@ -130,15 +131,22 @@ def _links(result: FitResult) -> list[str]:
     return [*lines, ""]
 
 
-def _value(result: FitResult, name: str, key: str) -> str:
+def _delay(result: FitResult) -> str:
+    """The delay in ms and in control steps."""
+    step, mode = 1e3 * result.control_dt, f"delay mode {result.delay_mode}"
+    steps = f"{result.parameters['delay'][ALL]:.4g} control steps of {step:g} ms"
+    return f"delay: {_value(result, 'delay', ALL, step)} ms ({steps}), {mode}"
+
+
+def _value(result: FitResult, name: str, key: str, factor: float = 1.0) -> str:
     if key not in result.parameters[name]:  # an effect that other joints have
         return "-"
     std = result.std[name][key]
     label = f"{name}/{key}"
     mark = " (at bound)" if label in result.at_bound else " (prior)" if label in result.undetermined else ""
     means_nothing = result.std_means_nothing and result.has_error_bar(name, key)
-    error = " ± ?" if means_nothing else "" if std is None else f" ± {std:.1g}"
-    return f"{result.parameters[name][key]:.5g}{error}{mark}"
+    error = " ± ?" if means_nothing else "" if std is None else f" ± {factor * std:.1g}"
+    return f"{factor * result.parameters[name][key]:.5g}{error}{mark}"
 
 
 def errors_of(result: FitResult, key: str) -> str:

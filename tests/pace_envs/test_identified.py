@@ -126,13 +126,13 @@ def test_a_step_that_changes_the_drive_is_warned_of(result):
         warnings.simplefilter("error")
         motor(cfg, DT)  # the identification's own
         motor(cfg, DT / 2)
-    with pytest.warns(UserWarning, match=r"delay of 8.5 ms is 1.7 control steps of 5 ms"):
+    with pytest.warns(UserWarning, match=r"delay of 8.5 ms \(1.7 control steps of 5 ms\) lies between two steps"):
         motor(cfg, 0.005)
     with pytest.warns(UserWarning, match=r"identified with physics steps of 2.5 ms, which are 0.5 ms here"):
         motor(cfg, 0.0005)
-    with pytest.warns(UserWarning, match=r"more than max_delay = 10: it was raised to 17"):
+    with pytest.warns(UserWarning, match=r"longer than max_delay, 5 ms: max_delay was raised to 17 steps"):
         assert motor(cfg, 0.0005).time_lags.item() == pytest.approx(17.0)
-    with pytest.warns(UserWarning, match=r"'hold' makes it 4 \(10 ms\)"):
+    with pytest.warns(UserWarning, match=r"\(3.4 control steps of 2.5 ms\) becomes 10 ms: with"):
         motor(PaceDCMotorCfg.from_result(result, delay_interpolation="hold"), DT)
 
 

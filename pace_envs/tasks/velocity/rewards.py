@@ -38,7 +38,9 @@ def velocity_rewards(
     }
 
 
-def energy_rewards(copper_loss: JointValue) -> dict[str, RewardTermCfg]:
+def energy_rewards(
+    copper_loss: JointValue, *, touching: tuple[str, ...] = ("knees", "base")
+) -> dict[str, RewardTermCfg]:
     """The four terms and weights of PACE, Bjelonic, Tischhauser and Hutter, arXiv 2509.06342.
 
     Velocity tracking 0.2, electrical power -16e-5 per watt, collisions -1, and a term on the feet with -0.1, which
@@ -46,11 +48,12 @@ def energy_rewards(copper_loss: JointValue) -> dict[str, RewardTermCfg]:
 
     Args:
         copper_loss: R / (r² k²) of each drive [W/(N m)²].
+        touching: Sensors of what should not touch the ground; ``("knees",)`` where the base does not collide.
     """
     term = RewardTermCfg
     return {
         "track_velocity": term(func=mdp.track_velocity_exp, weight=0.2, params={"std": 0.5, **_COMMAND}),
         "energy": term(func=mdp.electrical_power, weight=-16e-5, params={"copper_loss": copper_loss}),
-        "collision": term(func=mdp.undesired_contacts, weight=-1.0, params={"sensor_names": ("knees", "base")}),
+        "collision": term(func=mdp.undesired_contacts, weight=-1.0, params={"sensor_names": touching}),
         "feet": term(func=mdp.feet_slide, weight=-0.1, params={"sensor_name": "feet"}),
     }

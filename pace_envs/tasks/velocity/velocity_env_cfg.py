@@ -37,7 +37,7 @@ def velocity_env_cfg(
     robot: ArticulationCfg,
     *,
     feet: str,
-    base: str,
+    base: str | None,
     knees: str,
     action_scale: float,
     minimum_height: float | None = None,
@@ -49,19 +49,19 @@ def velocity_env_cfg(
     Args:
         robot: The robot; its initial state is the stance, its drives run at 200 Hz.
         feet: Expression of the feet.
-        base: Expression of what ends an episode where it touches the ground.
+        base: Expression of what ends an episode where it touches the ground; ``None`` for a base that does not collide:
+            its tilt and height alone end an episode then.
         knees: Expression of what should not touch the ground.
         action_scale: Change of a target per unit of action [rad].
         minimum_height: Height of the base below which it has fallen [m]; ``None``: half of that in the stance.
     """
-    return VelocityEnvCfg(
+    cfg = VelocityEnvCfg(
         scene=InteractiveSceneCfg(
             num_envs=512,
             robot=dataclasses.replace(robot, fix_base=False),
-            terrain=TerrainCfg(collision_geoms=(feet, base, knees), impratio=1.0),
+            terrain=TerrainCfg(collision_geoms=(feet, knees), impratio=1.0),
             contact_sensors={
                 "feet": ContactSensorCfg(geom_names=feet, track_velocity=True),
-                "base": ContactSensorCfg(geom_names=base),
                 "knees": ContactSensorCfg(geom_names=knees),
             },
         ),
@@ -74,7 +74,6 @@ def velocity_env_cfg(
         events=_resets(),
         terminations={
             "time_out": TerminationTermCfg(func=mdp.time_out, time_out=True),
-            "base_contact": TerminationTermCfg(func=mdp.illegal_contact, params={"sensor_name": "base"}),
             "bad_orientation": TerminationTermCfg(func=mdp.bad_orientation, params={"limit_angle": 1.0}),
             "base_height": TerminationTermCfg(
                 func=mdp.root_height_below_minimum,
@@ -89,6 +88,12 @@ def velocity_env_cfg(
             )
         },
     )
+    if base is not None:
+        cfg.scene.terrain = TerrainCfg(collision_geoms=(feet, base, knees), impratio=1.0)
+        cfg.scene.contact_sensors = {**cfg.scene.contact_sensors, "base": ContactSensorCfg(geom_names=base)}
+        touches = TerminationTermCfg(func=mdp.illegal_contact, params={"sensor_name": "base"})
+        cfg.terminations = {"time_out": cfg.terminations["time_out"], "base_contact": touches, **cfg.terminations}
+    return cfg
 
 
 def _observations() -> dict[str, ObservationTermCfg]:

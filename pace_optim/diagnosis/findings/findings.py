@@ -284,11 +284,12 @@ def summary_of(found: Findings, problem: Problem) -> str:
             text += f" {what}, {', '.join(found.paying)}, explains {part:.0f} % of what lies between."
         return " ".join([text, *hint_sentences(found.hints, problem.joint_names)])
     what = "all of it" if found.free_form else "it"
-    summary = (
-        f"{_missing(found)} On held-out recordings {what} explains {100 * found.explained:.0f} % of what lies above "
-        f"the floor ({floor:.3g} {unit})."
-    )
     far = found.outcome.far(found.data.floor).tolist()
+    percent = "over 99" if any(far) and found.explained > 0.99 else f"{100 * found.explained:.0f}"
+    summary = (
+        f"{_missing(found)} On held-out recordings {what} explains {percent} % of what lies above the floor "
+        f"({floor:.3g} {unit})."
+    )
     if any(far) and not found.free_form:
         where = conjoined(name for name, is_far in zip(problem.joint_names, far, strict=True) if is_far)
         summary += f" Something else is missing on {where} too, which no known effect explains."

@@ -97,7 +97,7 @@ class Search:
         untried = [e for e in self.effects if bool((branch.now.model.allowed_joints(e) & open_joints).any())]
         if depth == self.max_effects or not bool(open_joints.any()) or not untried:
             return None
-        self.say(f"looking for effect {depth + 1}: screening {len(untried)} candidates")
+        self.say(f"looking for effect {depth + 1} of at most {self.max_effects}: screening {len(untried)} candidates")
         places = open_joints.nonzero()[:, 0].tolist()
 
         def log(own: Decision) -> None:

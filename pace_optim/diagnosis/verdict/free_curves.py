@@ -142,7 +142,8 @@ def error_map(
         k = curves.best(j)
         effect, part = curves.effects[k], float(curves.explained[k, j])
         before, after = (float(each.mse[j].sqrt()) for each in (base_errors, curves.errors[k]))
-        types, told = joint_types[j : j + 1], not within(before**2, after**2, cfg.alike)
+        told = bool(curves.instead[j]) or not within(before**2, after**2, cfg.alike)
+        types = joint_types[j : j + 1]
         formula = _formula(curves.models[k], effect, j, cfg.alike - 1) if told else ""
         joints[joint_names[j]] = {
             "explained": {e.name: float(curves.explained[i, j]) for i, e in enumerate(curves.effects)},

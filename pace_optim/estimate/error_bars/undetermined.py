@@ -12,6 +12,7 @@ import torch
 from pace_actuators import match_names, resolve_joint_values
 from pace_actuators.base_parameters import CARRIED, PER_JOINT
 from pace_actuators.effects import effect_cfgs
+from pace_actuators.text import plural
 from pace_envs.tasks.pace import GLOBAL
 from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
@@ -48,9 +49,9 @@ def whole_delay(problem: Problem, delay: float, std: float | None) -> list[str]:
         return []
     step = 1e3 * problem.control_dt
     return [
-        f"The delay is exactly {round(delay)} control step{'s' * (round(delay) > 1)}. A drive that samples commands "
-        f"every {step:g} ms shows the same motion for any delay above {(round(delay) - 1) * step:g} and up to "
-        f"{round(delay) * step:g} ms. [W16]"
+        f"The delay of {round(delay) * step:g} ms is exactly {plural(round(delay), 'control step')}. A drive that "
+        f"samples commands every {step:g} ms shows the same motion for any delay above "
+        f"{(round(delay) - 1) * step:g} and up to {round(delay) * step:g} ms. [W16]"
     ]
 
 

@@ -161,11 +161,13 @@ def _sampled_commands(problem: Problem, rmse: dict[str, dict[str, float]], uncer
     """Whether the drives seem to have got commands more often than they were logged.
 
     What is logged with slow samples is then early by half of the time between two commands on average: no delay that
-    is 0 or more makes up for it, and the motion has none of the steps that held commands make.
+    is 0 or more makes up for it, and the motion has none of the steps that held commands make. A bias at its bound
+    shows another cause: the error is then not one of time.
     """
     slowest = max(r.sample_stride if r.des_time is None else 1 for r in problem.dataset.recordings)
     low = problem.space.lower[problem.space["delay"]]
-    at_bound = f"delay/{GLOBAL}" in uncertainty.at_bound and float(low) == 0
+    biased = any(label.startswith("encoder_bias/") for label in uncertainty.at_bound)
+    at_bound = f"delay/{GLOBAL}" in uncertainty.at_bound and float(low) == 0 and not biased
     if slowest == 1 or not at_bound or (times_noise(problem, rmse["train"].get(ALL)) or 0.0) < FAR_ABOVE_NOISE:
         return []
     return [
@@ -220,13 +222,20 @@ def _at_bounds(problem: Problem, physical: torch.Tensor, uncertainty: Uncertaint
     if not places:
         return []
     found = [
-        f"{name.replace('_', ' ')} ({side}, {bound:g} {space.unit_of(name, keys[0])}){_of(keys)}"
+        f"{name.replace('_', ' ')} ({side}, {_bound(problem, name, bound, keys[0])}){_of(keys)}"
         for (name, side, bound), keys in places.items()
     ]
     return [
         f"At a bound: {'; '.join(found)}. Find the missing physics that the value stands in for, or widen the bound. "
         "[W9]"
     ]
+
+
+def _bound(problem: Problem, name: str, bound: float, key: str) -> str:
+    """A bound with its unit; of the delay in ms."""
+    if (name, key) == ("delay", GLOBAL):
+        return f"{1e3 * problem.control_dt * bound:g} ms"
+    return f"{bound:g} {problem.space.unit_of(name, key)}"
 
 
 def in_words(labels: tuple[str, ...]) -> str:

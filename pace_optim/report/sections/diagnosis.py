@@ -13,7 +13,6 @@ from pace_actuators.text import in_words, listed, sizes_by_joints, three_figures
 
 from ..markup import Section, bold, bullets, figure, html, joined, table
 from ..run_data import RunData
-from .verdict import callout
 
 _SHOWN = 10
 """Effects in the chart, at most."""
@@ -28,7 +27,6 @@ def diagnosis(run: RunData) -> Section | None:
     if not content:
         return None
     parts = [
-        callout(content, run.result),
         _sizes(content),
         _ladder(content),
         _error_map(content),
@@ -36,7 +34,7 @@ def diagnosis(run: RunData) -> Section | None:
         _joints(content),
     ]
     parts += [_advice(content), _data(content)]
-    return Section(id="diagnosis", title="Which effect is missing", html=joined(parts))
+    return Section(id="diagnosis", title="Diagnosis", html=joined(parts))
 
 
 def _floor(content: dict[str, Any]) -> float:
@@ -65,8 +63,11 @@ def _sizes(content: dict[str, Any]) -> Markup:
         [bold(effect), parameter.replace("_", " "), listed(joints), text, ", ".join(likes.get(effect, [])) or "–"]
         for (effect, parameter, text), joints in sizes.items()
     ]
-    head = ["effect", "parameter", "joints", "size ± standard deviation", "cannot be separated from"]
-    return _titled("How large it is", table(head, rows))
+    known = any(size["std"] is not None for size in content["sizes"])
+    size = "size ± standard deviation" if known else "size"
+    about = "" if known else "without error bars: these joints end above their floor, or a value is at its bound"
+    head = ["effect", "parameter", "joints", size, "cannot be separated from"]
+    return _titled("How large it is", table(head, rows), about)
 
 
 def _ladder(content: dict[str, Any]) -> Markup:
@@ -141,7 +142,7 @@ def _chart(entries: list[dict[str, Any]], floor: float, factor: float, unit: str
         "xaxis": {"title": {"text": f"validation error [{unit}]"}, "rangemode": "tozero"},
         "yaxis": {"type": "category", "automargin": True, "showgrid": False},
         "hovermode": "closest",
-        "legend": {"traceorder": "reversed"},
+        "legend": {"traceorder": "reversed", "orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom"},
     }
     return figure("effect-ranking", [floor_line, *traces], layout, height=130 + 42 * len(names))
 
@@ -149,7 +150,7 @@ def _chart(entries: list[dict[str, Any]], floor: float, factor: float, unit: str
 def _evidence(entries: list[dict[str, Any]], factor: float, unit: str) -> Markup:
     rows = []
     for entry in entries:
-        state = "added" if entry.get("added") else "pays" if entry["significant"] else "does not pay"
+        state = "added" if entry.get("added") else "would pay" if entry["significant"] else "does not pay"
         rows.append(
             [
                 bold(_name(entry)),
@@ -190,17 +191,17 @@ def _error_map(content: dict[str, Any]) -> Markup:
     joints = {name: each for name, each in content.get("error_map", {}).items() if "explained" in each}
     if not joints:
         return Markup("")
-    curves = list(next(iter(joints.values()))["explained"])
+    parts = {name: joint["explained"] for name, joint in joints.items()}
+    curves = sorted(next(iter(parts.values())), key=lambda curve: -max(own[curve] for own in parts.values()))
     rows = [
-        [bold(name), *(f"{100 * max(0.0, joint['explained'][curve]):.0f} %" for curve in curves)]
-        for name, joint in joints.items()
+        [bold(in_words(curve)), *(f"{100 * max(0.0, own[curve]):.0f} %" for own in parts.values())] for curve in curves
     ]
     said = bullets([f"{name}: {joint['sentence']}" for name, joint in joints.items()], "notes")
     about = (
         "part of the squared error above the floor that a curve of any form explains by itself, "
         "on top of the base model"
     )
-    shown = table(["joint", *(in_words(curve) for curve in curves)], rows)
+    shown = table(["curve", *joints], rows)
     return _titled("What carries the error", said + _curve(content, joints) + shown, about)
 
 

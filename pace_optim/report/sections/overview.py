@@ -114,6 +114,10 @@ def _worst_joint(result: FitResult) -> tuple[str, float]:
     return max(((joint, value) for joint, value in errors.items() if joint != ALL), key=lambda item: item[1])
 
 
+def _times(ratio: float) -> str:
+    return "below 0.1" if ratio < 0.1 else f"{ratio:.3g}"
+
+
 _PARTS = ("train", "validation")
 
 
@@ -135,8 +139,10 @@ def _figures(result: FitResult) -> Markup:
         ("Found in", duration(result.wall_time_s), f"{result.simulated_steps / 1e6:.3g} M simulated steps"),
     ]
     if result.times_noise and train:
-        times = "0.1 times or less" if result.times_noise < 0.1 else f"{result.times_noise:.3g} times"
-        figures.insert(2, ("Noise", said(train / result.times_noise), f"the training error is {times} that"))
+        noise = train / result.times_noise
+        parts = [("training", train), ("validation", held_out)]
+        times = [f"{_times(error / noise)} × in {part}" for part, error in parts if error is not None]
+        figures.insert(2, ("Noise", said(noise), f"the error is {', '.join(times)}"))
     if result.objective:
         own, kept = ("–" if part is None else f"{part:.2e}" for part in map(result.objective.get, _PARTS))
         figures.insert(-1, ("Objective", own, f"in training, {kept} in validation"))

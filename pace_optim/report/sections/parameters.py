@@ -15,6 +15,13 @@ from ..run_data import RunData
 
 _CONFIDENCE = 1.96
 """Standard deviations on either side that hold the value with 95 % probability."""
+_BARS = (
+    "Bars span 1.96 standard deviations to either side (95 %). They include noise, the residuals' correlation in time, "
+    "the physics step and an assumed loop rate. They do not include physics that the model lacks."
+)
+_FAR = (
+    "The fit ended far above the noise, so the values have no error bars: physics that the model lacks counts for more."
+)
 _WIDTH, _HEIGHT, _INSET = 360, 20, 6
 
 
@@ -24,21 +31,22 @@ def parameters(run: RunData) -> Section:
     shared = [name for name, values in result.parameters.items() if set(values) == {ALL}]
     cards = [_card(run, name) for name in result.parameters if name not in shared]
     if shared:
-        rows = [_row(run, name, ALL, in_words(name), pretty_unit(result.unit_of(name, ALL)), None) for name in shared]
+        step = 1e3 * result.control_dt  # of the delay, which is shown in ms
+        units = {name: ("ms", step) if name == "delay" else (result.unit_of(name, ALL), 1.0) for name in shared}
+        rows = [_row(run, name, ALL, in_words(name), pretty_unit(u), None, f) for name, (u, f) in units.items()]
         note = html(
-            "{% if delay %}<p>The delay is that of the <b>{{ mode }}</b>: {{ delay }} ms at a control step of "
-            "{{ step }} ms.</p>{% endif %}",
+            "{% if delay %}<p>The delay is that of the <b>{{ mode }}</b>: {{ delay }} control steps of {{ step }} ms."
+            "</p>{% endif %}",
             mode=result.delay_mode,
-            delay=f"{1e3 * result.delay_s:.4g}" if "delay" in shared else "",
-            step=f"{1e3 * result.control_dt:g}",
+            delay=f"{1e3 * result.delay_s / step:.4g}" if "delay" in shared else "",
+            step=f"{step:g}",
         )
         head = ["", "value", "± std", "unit", "between its bounds", ""]
         cards.append(_article("The whole robot", "", table(head, rows, "values") + note))
     return Section(
         id="parameters",
         title="Parameters",
-        lead="Bars span 1.96 standard deviations to either side (95 %). They include noise, the residuals' correlation "
-        "in time, the physics step and an assumed loop rate. They do not include physics that the model lacks.",
+        lead=_FAR if result.std_means_nothing else _BARS,
         html=html('<div class="cards">{{ cards }}</div>', cards=joined(cards)),
     )
 
@@ -79,14 +87,17 @@ def _padded(low: float, high: float, run: RunData, name: str) -> tuple[float, fl
     return low - room, high + room
 
 
-def _row(run: RunData, name: str, key: str, title: str, unit: str, span: tuple[float, float] | None) -> list[str]:
+def _row(
+    run: RunData, name: str, key: str, title: str, unit: str, span: tuple[float, float] | None, factor: float = 1.0
+) -> list[str]:
+    """A value's cells; ``factor`` is what it is multiplied by where it is shown."""
     value, std = run.result.parameters[name][key], run.result.std.get(name, {}).get(key)
     label = f"{name}/{key}"
-    text, error = value_and_error(value, std)
+    text, error = value_and_error(factor * value, None if std is None else factor * std)
     if run.result.std_means_nothing and run.result.has_error_bar(name, key):
         error = "?"
     plot = unit if span is None else _interval(value, std, *span)
-    return [bold(title), text, error, plot, _between(run, label, value), _flags(run, label, value)]
+    return [bold(title), text, error, plot, _between(run, label, value, factor), _flags(run, label, value)]
 
 
 def _x(value: float, low: float, high: float) -> float:
@@ -145,7 +156,7 @@ def nice_ticks(low: float, high: float, most: int = 4) -> list[float]:
     return [i * step for i in range(first, math.floor(high / step) + 1)]
 
 
-def _between(run: RunData, label: str, value: float) -> str:
+def _between(run: RunData, label: str, value: float, factor: float) -> str:
     """A small bar from the lower to the upper bound."""
     if label not in run.bounds:
         return ""
@@ -156,9 +167,9 @@ def _between(run: RunData, label: str, value: float) -> str:
         '<span class="range{{ css }}"><small>{{ low }}</small><span class="track"><i style="left:{{ share }}%"></i>'
         "</span><small>{{ high }}</small></span>",
         css=css,
-        low=f"{low:g}",
+        low=f"{factor * low:g}",
         share=f"{100 * min(max(share, 0.0), 1.0):.1f}",
-        high=f"{high:g}",
+        high=f"{factor * high:g}",
     )
 
 

@@ -9,23 +9,17 @@ from typing import Any
 
 from markupsafe import Markup
 
-from pace_actuators.text import capitalised, conjoined, in_words, listed, sizes_by_joints
+from pace_actuators.text import capitalised, conjoined, listed, sizes_by_joints
 from pace_optim.run.result import FitResult
 from pace_optim.terminal.cli import command
 
 from ..markup import bullets, html, joined
 from ..run_data import RunData
 
-_HEADINGS = {
-    "link": ("good", "A link of the model file is wrong"),
-    "effect": ("good", "An effect is missing, and it is known"),
-    "nothing_missing": ("good", "Nothing is missing"),
-    "unknown": ("bad", "Something is missing, and no known effect explains it"),
-}
-_PARTLY = 0.8
-"""Effects that explain less than this part of the error above the floor are not all that is missing."""
 _SHOWN = 4
-"""Sizes in the overview, at most."""
+"""Sizes in the overview, and joints in the headline, at most."""
+_FAR = 3.0
+"""Times its floor above which a joint is far from it, in a diagnosis that does not state it."""
 
 
 def verdict_first(run: RunData) -> Markup:
@@ -49,79 +43,114 @@ def _in_short(run: RunData) -> Markup:
         f"{effect} cannot be separated from {', '.join(likes)}" for effect, likes in content.get("likes", {}).items()
     ]
     link = html('<p><a href="#diagnosis">What was tried, and the evidence</a></p>')
-    more = [*([bullets(said, "notes")] if said else []), _refit_link(run, content), link]
-    return callout(content, run.result, joined(more))
+    return _callout(run, content, joined([bullets(said, "notes"), link] if said else [link]))
 
 
 def headline(run: RunData) -> str:
     """The verdict for the top of the page: "Missing: Stribeck friction at LF_KFE and RF_KFE"; else ""."""
     with run.blaming("diagnosis.json"):
         content = run.read_json("diagnosis.json")
-        return _headline(content, run.result) if content else ""
+        return _heading(run, content)[1] if content else ""
 
 
-def _headline(content: dict[str, Any], run: FitResult) -> str:
-    css, heading, has_it = _heading(content, run)
+def _heading(run: RunData, content: dict[str, Any]) -> tuple[str, str]:
+    """Class and words of a diagnosis' heading. It is good where nothing is missing beside what was found."""
+    fit, has_it = run.result, _has_it(run.result, content)
+    left = f"{fit.times_noise or 0.0:,.0f} times the noise" if fit.std_means_nothing else ""
+    if content["verdict"] == "nothing_missing":
+        if left:  # each joint alone is at its floor: the fit of the robot is not
+            return "bad", f"No effect is missing, but this fit ended at {left}"
+        return "good", "Nothing is missing"
+    found = conjoined(_found(content))
+    if not found:
+        curves = set(content.get("free_form", []))
+        part = "all of it" if set(content.get("paying", [])) - curves else "it"
+        return "bad", f"Something is missing, and no known effect explains {part}"
+    joints = _unexplained(content)
+    if joints or content["verdict"] == "unknown":
+        where = f" on {listed(joints, _SHOWN)}" if joints else ""
+        begin = "In this run" if has_it else "Missing" if content["added"] else "Wrong in the model file"
+        return "bad", f"{begin}: {found}. More is missing{where}"
+    if has_it:
+        if left:
+            return "bad", f"In this run: {found}. More is missing: the error is {left}"
+        return "good", f"What was missing is in this run: {found}"
+    begin, this = ("Missing", " in this run") if content["added"] else ("Wrong in the model file", " of this run")
+    return "good", f"{begin}{this if _other_run(run, content) else ''}: {found}"
+
+
+def _found(content: dict[str, Any]) -> list[str]:
+    """What the diagnosis names: "Stribeck friction at LF_KFE", "mass of the link shank"; a single "" without names."""
     names = [f"{' and '.join(link['parts'])} of the link {link['link']}" for link in content.get("links", [])]
     for effect in dict.fromkeys(label.partition("@")[0] for label in content["added"]):
         joints = [name for name, joint in content["joints"].items() if effect in joint["effects"]]
         where = listed(joints) if len(joints) <= _SHOWN else f"{len(joints)} joints"
         names.append(f"{effect.replace('_', ' ')} at {where}" if joints else effect)
-    if css == "bad" or not names:
-        return heading
-    begin = heading if has_it else "Missing" if content["added"] else "Wrong in the model file"
-    return f"{begin}: {capitalised(conjoined(names))}"
+    return [capitalised(names[0]), *names[1:]] if names else [""]
 
 
-def _heading(content: dict[str, Any], run: FitResult) -> tuple[str, str, bool]:
-    """Class and words of a verdict's heading, and whether the run has what was missing."""
-    css, heading = _HEADINGS.get(content["verdict"], ("bad", in_words(content["verdict"])))
-    effects, part = content.get("paying") or content["added"], content.get("explained", 1.0)
-    links = content.get("links", [])
+def _unexplained(content: dict[str, Any]) -> list[str]:
+    """Joints on which more is missing than was found: far from their floor, or with a curve of any form."""
+    far = content.get("cfg", {}).get("judging", {}).get("far", _FAR)
+    curves = {label.partition("@")[0] for label in content.get("free_form", [])}
+    return [
+        name
+        for name, joint in content["joints"].items()
+        if joint["validation_rmse_after"] > far * joint["floor"] or curves & set(joint["effects"])
+    ]
+
+
+def _has_it(fit: FitResult, content: dict[str, Any]) -> bool:
+    """Whether a fit has the effects and links that the diagnosis found."""
+    effects, links = content.get("paying") or content["added"], content.get("links", [])
     found = {(value["parameter"], link["link"]) for link in links for value in link["values"]}
-    sought = {(name, key) for name, values in run.parameters.items() for key in values}
-    has_it = bool(effects or links) and set(effects) <= set(run.effects) and found <= sought
-    if has_it and content["verdict"] in ("effect", "link"):
-        heading = "What was missing is in this run"
-    if content.get("free_form"):
-        part_known = "only a part of it is known" if content["added"] else "no known effect explains it"
-        css, heading = "bad", f"Something is missing, and {part_known}: a curve takes the place of what is not"
-    elif content["verdict"] not in ("nothing_missing", "link") and effects and (not content["added"] or part < _PARTLY):
-        css, heading = "bad", f"Something is missing, and known effects explain {100 * max(0.0, part):.0f} % of it"
-    return css, heading, has_it
+    sought = {(name, key) for name, values in fit.parameters.items() for key in values}
+    return bool(effects or links) and set(effects) <= set(fit.effects) and found <= sought
 
 
-def callout(content: dict[str, Any], run: FitResult, more: Markup | str = "") -> Markup:
-    """What is missing, and how to add it to a run, unless that has it."""
-    css, heading, has_it = _heading(content, run)
+def _callout(run: RunData, content: dict[str, Any], more: Markup) -> Markup:
+    """What is missing, and the run that has it, or how to add it to a run."""
     effects = content.get("paying") or content["added"]
     links = [link["label"] for link in content.get("links", [])]
+    other = _other_run(run, content)
     return html(
-        '<div class="callout {{ css }}"><h3>{{ heading }}</h3><p>{{ summary }}</p>{% if has_it %}<p>This run is the '
-        "fit with it.</p>{% elif (effects or links) and not refitted %}<p>{{ why }}: <code>{{ command }} …"
-        "{% if effects %} --effects {{ effects }}{% endif %}{% if links %} --links {{ links }}{% endif %}</code></p>"
-        "{% endif %}{{ more }}</div>",
-        css=css,
-        heading=heading,
+        '<div class="callout {{ css }}"><p>{{ summary }}</p>'
+        "{% if has_it %}<p>This run is the fit with it.</p>{% elif (effects or links) and not other %}<p>{{ why }}: "
+        "<code>{{ command }} …{% if effects %} --effects {{ effects }}{% endif %}{% if links %} --links {{ links }}"
+        '{% endif %}</code></p>{% endif %}{% if other %}<p>{{ "The run without it" if has_it else "The run with it" }}:'
+        ' <b><a href="{{ other }}/report.html">{{ other.name }}</a></b></p>{% endif %}{{ more }}</div>',
+        css=_heading(run, content)[0],
         summary=content["summary"],
-        has_it=has_it,
-        effects=shlex.join(dict.fromkeys([*run.effects, *effects])),
+        has_it=_has_it(run.result, content),
+        effects=shlex.join(dict.fromkeys([*run.result.effects, *effects])),
         links=shlex.join(links),
-        refitted=len(content["runs"]) > 1,
+        other=other,
         why="Add it" if content["added"] or links else "Until it is known, this lowers the error",
         command=command("fit"),
         more=more,
     )
 
 
-def _refit_link(run: RunData, content: dict[str, Any]) -> Markup:
-    """A link from a run to its refit, and back."""
-    here, places = run.folder.resolve(), [Path(each) for each in content["runs"]]
-    others = [place for place in places if place.name != here.name]
-    if len(places) < 2 or not others:
-        return Markup("")
-    beside = here.parent / others[0].name  # runs that are moved are moved together
-    other = beside if beside.is_dir() else others[0].resolve()
-    what = "The run with it" if places[0].name == here.name else "The run without it"
-    href = f"{Path(os.path.relpath(other, here)).as_posix()}/report.html"
-    return html('<p>{{ what }}: <a href="{{ href }}">{{ name }}</a></p>', what=what, href=href, name=other.name)
+def _other_run(run: RunData, content: dict[str, Any]) -> Path | None:
+    """From a diagnosed run to the one with what was missing, and back: its folder, seen from the run's.
+
+    That is the refit of the diagnosis, or the last run beside it that has what was found on the same recordings.
+    """
+    here, places, has_it = run.folder.resolve(), [Path(each) for each in content["runs"]], _has_it(run.result, content)
+    if len(places) > 1 or has_it:
+        others = [place for place in places if place.name != here.name]
+    else:
+        others = [path.parent for path in sorted(here.parent.glob("*/result.json")) if _answers(path, run, content)]
+    if not others:
+        return None
+    beside = here.parent / others[-1].name  # runs that are moved are moved together
+    return Path(os.path.relpath(beside if beside.is_dir() else others[-1].resolve(), here))
+
+
+def _answers(path: Path, run: RunData, content: dict[str, Any]) -> bool:
+    """Whether a run beside this one has what was found, on the same recordings; not if it cannot be read."""
+    try:
+        other = FitResult.load(path.parent)
+    except ValueError:
+        return False
+    return other.recordings == run.result.recordings and _has_it(other, content)

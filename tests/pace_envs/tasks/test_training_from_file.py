@@ -15,7 +15,7 @@ from pace_envs.robots import go2_cfg
 from pace_envs.task_source import model_files
 from pace_envs.tasks.reach import reach_env_cfg
 from pace_envs.tasks.reach.terms import site_position
-from pace_envs.tasks.velocity import add_randomization, velocity_env_cfg, velocity_rewards
+from pace_envs.tasks.velocity import add_randomization, energy_rewards, velocity_env_cfg, velocity_rewards
 
 LEGS = tuple(itertools.product((0.2, -0.2), (0.1, -0.1)))
 CORNERS = list(itertools.product((-0.5, 0.5), repeat=3))
@@ -97,6 +97,24 @@ def test_a_urdf_of_meshes_stands_on_its_feet_in_a_velocity_task(folder):
     weight = (float(model.body_mass.sum()) + 2.0) * 9.81  # of the trunk, 2 kg more
     assert feet.in_contact.all()
     assert feet.net_forces_w[..., 2].sum(dim=1).tolist() == pytest.approx([weight] * 2, rel=0.02)
+    env.close()
+
+
+def test_a_robot_whose_base_does_not_collide_is_trained_by_its_tilt_and_height(folder):
+    text = (folder / "robot.urdf").read_text()
+    (folder / "robot.urdf").write_text(
+        text.replace(text[text.index("<collision>") : text.index('<link name="leg_0">')], "</link>")
+    )
+    robot = robot_cfg_from_model(folder / "robot.urdf", {"hip_.": 0.3})
+    with pytest.raises(ValueError, match=r"'trunk' .*colliding geom or body"):
+        ManagerBasedRLEnv(velocity_env_cfg(robot, feet="foot_.", base="trunk", knees="foot_0", action_scale=0.25))
+    cfg = velocity_env_cfg(robot, feet="foot_.", base=None, knees="foot_0", action_scale=0.25)
+    assert set(cfg.terminations) == {"time_out", "bad_orientation", "base_height", "diverged"}
+    cfg.rewards, cfg.scene.num_envs = energy_rewards(0.1, touching=("knees",)), 2
+    env = ManagerBasedRLEnv(cfg)
+    env.reset()
+    env.step(torch.zeros(2, 4, dtype=env.dtype))
+    assert set(env.scene.sensors) == {"feet", "knees"}
     env.close()
 
 

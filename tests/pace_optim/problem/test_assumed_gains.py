@@ -57,6 +57,18 @@ def test_stated_gains_are_those_that_act(robot):
     assert problem.contradictions == () and error_of(problem) < 2e-3
 
 
+def test_notes_are_of_what_is_stated(robot):
+    """They said what would hold without the facts beside the log and without --drive_dt."""
+    plain, told = recorded(robot), recorded(robot, stiffness=KP, damping=KD)
+    notes = load_problem(str(robot), data=[told], drive_dt=0.001).env_cfg.sim2real.notes
+    assert "gains: those that the recordings state" in notes
+    assert "drive loops: they run every 1 ms, by --drive_dt" in notes
+    assert not any("the file has none" in note or "without it" in note for note in notes)
+    recorded(robot)  # the same file without gains
+    notes = load_problem(str(robot), data=[plain]).env_cfg.sim2real.notes
+    assert any("the file has none" in note for note in notes) and any("without it" in note for note in notes)
+
+
 def test_gains_that_are_sought_are_no_warning(robot):
     problem = load_problem(str(robot), data=[recorded(robot)], unknown=("stiffness", "damping"))
     assert problem.contradictions == () and "proportional_gain" in problem.effects

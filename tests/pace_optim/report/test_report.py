@@ -36,6 +36,7 @@ def test_it_names_every_joint_parameter_and_error(page):
     assert "follows the robot to 4.3 mrad on data it was not fitted to" in page.text
     assert "On the data it was fitted to, it is 3.1 mrad." in page.text
     assert "The worst joint is ankle with 6.1 mrad." in page.text
+    assert "12.50 0.25 ms 0 25" in page.text and "5 control steps of 2.5 ms" in page.text  # the delay
     assert "at its upper bound" in page.text and "cannot be separated from encoder bias" in page.text
     assert "resampled from 500 Hz." in page.text
     assert "scripts/fit.py --task Pace-Leg-v0" in page.text

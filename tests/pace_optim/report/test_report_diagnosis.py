@@ -26,7 +26,7 @@ def test_it_says_what_is_missing_and_on_what_evidence(tmp_path):
     page = page_of(folder_with(tmp_path / "run", make_diagnosis()))
     assert {"diagnosis", "effect-ranking"} <= set(page.ids) and "error-map" not in page.ids
     for text in (
-        "An effect is missing, and it is known",
+        "Missing: Stribeck friction at hip, knee, ankle",
         "--effects stribeck_friction",
         "4.30 → 0.400",
         "does not pay",
@@ -42,24 +42,71 @@ def test_it_says_what_is_missing_and_on_what_evidence(tmp_path):
 def test_the_run_with_what_was_missing_is_not_told_to_add_it(tmp_path):
     with_it = folder_with(tmp_path / "with", make_diagnosis())
     make_result(effects=["stribeck_friction"]).save(with_it / "result.json")
-    without = page_of(folder_with(tmp_path / "without", make_diagnosis())).text
+    without = page_of(folder_with(tmp_path / "alone" / "run", make_diagnosis())).text
     assert "Add it" in without and "This run is the fit with it." not in without
     text = page_of(with_it).text
     assert "This run is the fit with it." in text and "What was missing is in this run" in text
-    assert "Add it" not in text and "An effect is missing" not in text
+    assert "Add it" not in text and "Missing in this run" not in text
+    # the report of a diagnosed run names the run beside it
+    text = page_of(folder_with(tmp_path / "without", make_diagnosis())).text
+    assert "Missing in this run: Stribeck friction" in text and "The run with it: with" in text
+    assert "Add it" not in text
+
+
+CURVE = "torque_over_position@hip"
+MORE = {"joints": {**make_diagnosis()["joints"], "hip": {**make_diagnosis()["joints"]["hip"], "floor": 1e-5}}}
+"""The hip ends far from its floor."""
+
+
+@pytest.mark.parametrize(
+    ("content", "run", "headline"),
+    [
+        ({}, {}, "Missing: Stribeck friction at hip, knee, ankle"),
+        (MORE, {}, "Missing: Stribeck friction at hip, knee, ankle. More is missing on hip"),
+        ({}, {"effects": ["stribeck_friction"]}, "What was missing is in this run: Stribeck friction"),
+        (
+            {},
+            {"effects": ["stribeck_friction"], "std_means_nothing": True, "times_noise": 40.0},
+            "In this run: Stribeck friction at hip, knee, ankle. More is missing: the error is 40 times the noise",
+        ),
+        (
+            {"added": [], "verdict": "unknown", "paying": [CURVE], "free_form": [CURVE]},
+            {},
+            "Something is missing, and no known effect explains it",
+        ),
+        (
+            {"added": [], "verdict": "unknown", "paying": ["stribeck_friction", CURVE], "free_form": [CURVE]},
+            {},
+            "Something is missing, and no known effect explains all of it",
+        ),
+        (
+            {"added": [], "verdict": "nothing_missing"},
+            {"std_means_nothing": True, "times_noise": 40.0},
+            "No effect is missing, but this fit ended at 40 times the noise",
+        ),
+    ],
+)
+def test_the_headline_never_claims_more_than_the_verdict(tmp_path, content, run, headline):
+    """ "100 % explained" stood beside "something else is missing"."""
+    folder = folder_with(tmp_path / "run", make_diagnosis() | content)
+    make_result(**run).save(folder / "result.json")
+    text = page_of(folder).text
+    assert text.count(headline) == 1
+    good = headline.startswith(("What was", "Missing: ")) and "More" not in headline
+    assert ('class="callout bad"' not in write_report(folder).read_text("utf-8").partition("Error of each")[0]) == good
 
 
 def test_the_run_with_a_wrong_link_is_not_told_to_add_it(tmp_path):
     mass = {"parameter": "link_mass", "unit": "kg", "file": 0.5, "found": 0.8, "std": 0.01}
     wrong = [{"link": "shank", "parts": ["mass"], "values": [mass], "label": "shank@mass"}]
     told = make_diagnosis("link") | {"added": [], "paying": [], "links": wrong}
-    without, with_it = (folder_with(tmp_path / name, told) for name in ("without", "with"))
+    without, with_it = (folder_with(tmp_path / name, told) for name in ("alone/without", "with"))
     result = make_result()
     link = {"parameters": {"shank": 0.8}, "std": {"shank": 0.01}, "units": "kg"}
     result = replace(result, **{name: {**getattr(result, name), "link_mass": value} for name, value in link.items()})
     result.save(with_it / "result.json")
     text = page_of(without).text
-    assert "A link of the model file is wrong" in text and "--links shank@mass" in text
+    assert "Wrong in the model file: Mass of the link shank" in text and "--links shank@mass" in text
     text = page_of(with_it).text
     assert "What was missing is in this run" in text and "Add it" not in text
 

@@ -291,6 +291,14 @@ def test_no_effect_is_put_first_where_none_dominates(bench):
     )
 
 
+def test_nothing_is_explained_to_100_percent_where_more_is_missing(bench):
+    for rmse, part in ((4e-4, "over 99 %"), (1e-4, "100 %")):
+        found = told_of(ended(bench, rmse, (STRIBECK, [True], [1.0, 0.1])), "effect", {STRIBECK: 1.0})
+        said = summary_of(replace(found, explained=0.9996), bench.problem)
+        assert f"it explains {part} of what lies above" in said
+        assert ("Something else is missing on servo too" in said) is (rmse > 3e-4)
+
+
 def test_what_is_unknown_is_told_with_what_comes_nearest(bench):
     outcome = ended(bench, 5e-3, (SPRING, [True], [2.0, 0.1]))
     hint = Hint(effect="parallel_spring", joint=0, explained=0.75, doubts=["it is at a bound", "no drive has it"])
@@ -339,4 +347,4 @@ def test_it_is_fitted_to_the_whole_robot_all_the_same(run, bench, monkeypatch, s
     page = write_report(run.folder).read_text("utf-8")
     advice = "this lowers the error: <code>scripts/fit.py … --effects parallel_spring</code>"
     assert (advice in page) is broken_off  # a refit has it
-    assert "Something is missing, and known effects explain 75 % of it" in page
+    assert "<h1>Something is missing, and no known effect explains all of it</h1>" in page

@@ -88,8 +88,12 @@ def test_the_report_opens_with_the_verdict_its_sizes_and_the_run_that_has_it(tmp
     pages = [page_of(each) for each in (folder, refit)]
     for page in pages:
         first = page.text.split("Error of each joint")[0]
-        assert "An effect is missing, and it is known" in first and "of joint_3: 3 ± 0.002" in first
-        assert "and 2 more" in first and "torque_gain cannot be separated from payload" in first
+        assert "Missing in this run: Stribeck friction at hip, knee, ankle" in first
+        assert (
+            "of joint_3: 3 ± 0.002" in first
+            and "and 2 more" in first
+            and "torque_gain cannot be separated from payload" in first
+        )
     html = (folder / "report.html").read_text("utf-8"), (refit / "report.html").read_text("utf-8")
     assert 'href="../refit/report.html"' in html[0] and 'href="../run/report.html"' in html[1]
 

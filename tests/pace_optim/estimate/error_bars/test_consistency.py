@@ -95,7 +95,7 @@ def test_a_delay_longer_than_a_controller_of_another_rate_allows_is_refused(monk
 
     monkeypatch.setattr("pace_optim.problem.problem.load_env_cfg", cfg)
     monkeypatch.setattr(ManagerBasedRLEnv, "__init__", lambda *args: pytest.fail("checked too late"))
-    with pytest.raises(ValueError, match=r"upper bound is 10 control steps, but the drive allows max_delay = 2\.5"):
+    with pytest.raises(ValueError, match=r"bound is 100 ms \(10 control steps\), but the drive allows 25 ms"):
         load_problem("Pace-TestBench-v0")
 
 

@@ -1,5 +1,6 @@
 """What a user must be told: critical delays against closed forms, bounds, over-fitting, in plain words."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -143,8 +144,22 @@ def test_bounds_are_told_with_side_and_value_and_joints_are_gathered():
     told = fit_warnings(problem, at, known(problem, at_bound=labels), FINE)
     assert len(told) == 1 and told[0].startswith(
         "At a bound: friction (upper, 2 N m) of servo; encoder bias (lower, -0.1 rad) of servo; "
-        "delay (upper, 10 control steps). Find the missing physics"
+        "delay (upper, 25 ms). Find the missing physics"
     )
+
+
+@pytest.mark.parametrize(
+    ("others", "expected"), [((), True), (("friction/servo",), True), (("encoder_bias/servo",), False)]
+)
+def test_commands_count_as_logged_too_rarely_unless_a_bias_at_its_bound_shows_another_cause(others, expected):
+    problem = make_problem(record(noise=1e-4))
+    slow = dataclasses.replace(problem.dataset.recordings[0], sample_stride=8)
+    problem = dataclasses.replace(problem, dataset=dataclasses.replace(problem.dataset, recordings=(slow,)))
+    far = {"train": {"all": 5e-3}, "validation": {}}
+    at = physical(problem, {**TRUTH, "delay": 0.0, "friction": 2.0, "encoder_bias": -0.1})
+    told = fit_warnings(problem, at, known(problem, at_bound=("delay/all", *others)), far)
+    assert any("logged with the samples, every 20 ms" in each for each in told) is expected
+    assert any("At a bound: " in each for each in told)
 
 
 def test_a_fit_whose_truth_is_beyond_a_bound_is_told():
