@@ -315,7 +315,7 @@ def delayed(history: np.ndarray, k: int, delay: np.ndarray) -> np.ndarray:
 
 
 def _flat(rows: np.ndarray) -> np.ndarray:
-    """Places in a history (T, R, n) of each entry at a row of its own, (..., R, n)."""
+    """Places in a history (T, R, n) of its entries at separate rows (..., R, n)."""
     shape = rows.shape[-2:]
     return rows * (shape[0] * shape[1]) + np.arange(shape[0] * shape[1]).reshape(shape)
 
