@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 
 from pace_actuators.effects import Effect
-from pace_actuators.text import listed
+from pace_actuators.text import SHOWN, listed
 from pace_optim.joints.fits.base_fit import whole_robot
 from pace_optim.joints.fits.fits import Fits
 from pace_optim.joints.fits.fitted import Fitted
@@ -42,7 +42,7 @@ class ReferenceUpdate:
             twins: The joints along the present reference.
             now: The model, fitted along it.
         """
-        names = listed([effect.name for effect in now.model.effects] or ["the base model"], 3)
+        names = listed([effect.name for effect in now.model.effects] or ["the base model"], SHOWN)
         alone, cfg = self.problem.joints_stand_alone, self.fits.cfg
         # what a link's inertia changes is linear in an effect's parameters only near what they have here
         on_links = any(effect.overrides("write_model") for effect in now.model.effects)
