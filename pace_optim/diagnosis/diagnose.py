@@ -50,7 +50,7 @@ def diagnose(
     """
     begin = time.monotonic()
     progress = progress or ProgressLine()
-    progress.say("reading the run and its recordings")
+    progress.wait_for("reading the run and its recordings")
     run = Run.open(settings.run, settings.task)
     folder = run.folder
     check_folder(folder, anew=FILE)

@@ -285,7 +285,8 @@ def summary_of(found: Findings, problem: Problem) -> str:
         return " ".join([text, *hint_sentences(found.hints, problem.joint_names)])
     what = "all of it" if found.free_form else "it"
     far = found.outcome.far(found.data.floor).tolist()
-    percent = "over 99" if any(far) and found.explained > 0.99 else f"{100 * found.explained:.0f}"
+    percent = f"{100 * found.explained:.0f}"
+    percent = "over 99" if any(far) and percent == "100" else percent
     summary = (
         f"{_missing(found)} On held-out recordings {what} explains {percent} % of what lies above the floor "
         f"({floor:.3g} {unit})."

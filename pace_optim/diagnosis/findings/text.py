@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from typing import Any
 
 from pace_actuators.joint_units import units_for
-from pace_actuators.text import conjoined, listed, shortened, sizes_by_joints
+from pace_actuators.text import SHOWN, conjoined, listed, shortened, sizes_by_joints
 from pace_optim.diagnosis.findings.result import Diagnosis
 
 _EFFECTS = 8
 """Effects in the list of what was tried, at most."""
-_JOINTS = 3
-"""Joints of an effect that are named, at most."""
 
 
 def lines_of(diagnosis: Diagnosis) -> list[str]:
@@ -28,7 +26,7 @@ def lines_of(diagnosis: Diagnosis) -> list[str]:
         mark = "added" if entry["added"] else ("would pay" if entry["significant"] else "does not pay")
         unit = units_for("mrad", diagnosis.joint_types(entry["joints"]))
         joints = entry["joints"]
-        where = f"on {listed(joints) if len(joints) <= _JOINTS else f'{len(joints)} of {len(names)} joints'}"
+        where = f"on {listed(joints) if len(joints) <= SHOWN else f'{len(joints)} of {len(names)} joints'}"
         where = where if len(names) > 1 else ""
         lines.append(f"  {entry['effect']:26s} {before:8.3f} -> {after:8.3f} {unit}  {mark:13s}  {where}".rstrip())
     return lines + [f"- {sentence}" for sentence in shortened(diagnosis.data, "note")]

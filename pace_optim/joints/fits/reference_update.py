@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 
 from pace_actuators.effects import Effect
+from pace_actuators.text import SHOWN, listed
 from pace_optim.joints.fits.base_fit import whole_robot
 from pace_optim.joints.fits.fits import Fits
 from pace_optim.joints.fits.fitted import Fitted
@@ -41,12 +42,13 @@ class ReferenceUpdate:
             twins: The joints along the present reference.
             now: The model, fitted along it.
         """
-        self.say("simulating the whole robot with the found effects")
+        names = listed([effect.name for effect in now.model.effects] or ["the base model"], SHOWN)
         alone, cfg = self.problem.joints_stand_alone, self.fits.cfg
         # what a link's inertia changes is linear in an effect's parameters only near what they have here
         on_links = any(effect.overrides("write_model") for effect in now.model.effects)
         made: list[tuple[TwinProblem, Fitted]] = []
-        for _ in range(cfg.rounds):
+        for k in range(cfg.rounds):
+            self.say(f"simulating the whole robot with {names}, round {k + 1} of at most {cfg.rounds}")
             if alone and not on_links and self.away(twins, now) < cfg.near:  # gravity is linear there
                 break
             before = now.score

@@ -65,7 +65,8 @@ def _heading(run: RunData, content: dict[str, Any]) -> tuple[str, str]:
     if not found:
         curves = set(content.get("free_form", []))
         part = "all of it" if set(content.get("paying", [])) - curves else "it"
-        return "bad", f"Something is missing, and no known effect explains {part}"
+        instead = ": a curve takes its place" if curves else ""
+        return "bad", f"Something is missing, and no known effect explains {part}{instead}"
     joints = _unexplained(content)
     if joints or content["verdict"] == "unknown":
         where = f" on {listed(joints, _SHOWN)}" if joints else ""

@@ -72,12 +72,12 @@ MORE = {"joints": {**make_diagnosis()["joints"], "hip": {**make_diagnosis()["joi
         (
             {"added": [], "verdict": "unknown", "paying": [CURVE], "free_form": [CURVE]},
             {},
-            "Something is missing, and no known effect explains it",
+            "Something is missing, and no known effect explains it: a curve takes its place",
         ),
         (
             {"added": [], "verdict": "unknown", "paying": ["stribeck_friction", CURVE], "free_form": [CURVE]},
             {},
-            "Something is missing, and no known effect explains all of it",
+            "Something is missing, and no known effect explains all of it: a curve takes its place",
         ),
         (
             {"added": [], "verdict": "nothing_missing"},

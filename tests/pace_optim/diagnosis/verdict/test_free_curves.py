@@ -288,4 +288,4 @@ def test_an_unknown_effect_gets_a_curve_and_the_robot_is_fitted_with_it(run):
     before, after = (step["validation_rmse"] for step in found.ladder)
     assert refit.rmse["validation"]["all"] == pytest.approx(after, rel=0.5) and after < 0.5 * before
     page = write_report(found.runs[-1]).read_text("utf-8")
-    assert "no known effect explains it: a curve takes the place" in page and "error-map" in page
+    assert "no known effect explains it: a curve takes its place" in page and "error-map" in page
