@@ -17,9 +17,9 @@ from pace_optim.diagnosis.findings.findings import Findings
 from pace_optim.diagnosis.search.one_round import try_effects
 from pace_optim.diagnosis.search.pooling import pool
 from pace_optim.diagnosis.search.search import add_effects
-from pace_optim.diagnosis.search.state import Search
+from pace_optim.diagnosis.search.state import Outcome, Search
 from pace_optim.diagnosis.selection.decisions import Log, unlogged
-from pace_optim.diagnosis.verdict.free_curves import fit_curves, take_curves
+from pace_optim.diagnosis.verdict.free_curves import Curves, fit_curves, take_curves
 from pace_optim.diagnosis.verdict.names import earned_names, new_effects, shares_of
 from pace_optim.diagnosis.verdict.verdict import part_explained, verdict
 from pace_optim.joints.fits.base_fit import fit_base
@@ -105,19 +105,27 @@ def search_effects(
     names = earned_names(fits, outcome, data.floor, log)
     outcome = pool(fits, names.outcome, log)
     curves = fit_curves(fits, outcome, data.floor, names.named, say, log)
-    decision, outcome = verdict(take_curves(outcome, curves), data.floor, names.named)
-    shares = shares_of(names, outcome)
-    kept = new_effects(outcome, outcome.final.model)
-    named = [(outcome.final.model.effects[row], j) for row, j in kept.nonzero().tolist() if decision == "effect"]
-    return Findings(
-        outcome=outcome,
-        joint_names=problem.joint_names,
-        data=replace(data, sentences=[*data.sentences, *late, *why]),
-        absorbed={effect: joints for effect, joints in absorbed.items() if effect not in shares},
-        verdict=decision,
-        explained=part_explained(outcome, data.floor),
-        shares=shares,
-        named={each: names.evidence[each] for each in named},
-        hints=names.hints,
-        curves=curves,
-    )
+
+    def findings(outcome: Outcome, named: torch.Tensor, curves: Curves | None = None) -> Findings:
+        decision, outcome = verdict(outcome, data.floor, named)
+        shares = shares_of(names, outcome)
+        kept = new_effects(outcome, outcome.final.model)
+        pairs = [(outcome.final.model.effects[row], j) for row, j in kept.nonzero().tolist() if decision == "effect"]
+        return Findings(
+            outcome=outcome,
+            joint_names=problem.joint_names,
+            data=replace(data, sentences=[*data.sentences, *late, *why]),
+            absorbed={effect: joints for effect, joints in absorbed.items() if effect not in shares},
+            verdict=decision,
+            explained=part_explained(outcome, data.floor),
+            shares=shares,
+            named={each: names.evidence[each] for each in pairs},
+            hints=names.hints,
+            curves=curves,
+        )
+
+    found = findings(take_curves(outcome, curves), names.named, curves)
+    if not names.hints or problem.joints_stand_alone:
+        return found
+    hinted = torch.tensor([any(hint.joint == j for hint in names.hints) for j in range(n)])
+    return replace(found, on_trial=replace(findings(outcome, names.named | hinted), hints=()))
