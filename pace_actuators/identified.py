@@ -22,7 +22,8 @@ from pace_actuators.own_code import checked_record
 if TYPE_CHECKING:
     from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
 
-DRIVE_FIELDS = ("stiffness", "damping", "effort_limit", "saturation_effort", "velocity_limit")
+LIMITS = ("effort_limit", "saturation_effort", "velocity_limit")
+DRIVE_FIELDS = ("stiffness", "damping", *LIMITS)
 """Facts about the drive that was recorded, named as in ``PaceDCMotorCfg``."""
 
 RATE_FLAGS = ("implicit", "centred_commands", "second_order")
@@ -190,7 +191,9 @@ class IdentifiedDrives:
             if self.determined(name, joints):  # where none is, the drive keeps its own
                 fields[name] = _by_pattern(self.values(name, joints))
         for name in DRIVE_FIELDS:
-            known = self.drive.get(name) or {}
+            known: Mapping[str, float] = self.drive.get(name) or {}
+            if known and name in LIMITS:  # a joint that is not there has none
+                known = dict.fromkeys(joints, math.inf) | dict(known)
             if all(joint in known for joint in joints):
                 fields[name] = _by_pattern({joint: float(known[joint]) for joint in joints})
         return fields | self._rate_of(joints)

@@ -99,23 +99,30 @@ def doubts(cfg: ManagerBasedEnvCfg, identified: IdentifiedDrives | str | Path) -
         cfg: The environment, with its own gains and limits.
         identified: As for :func:`use_identified`.
     """
-    drives, found = IdentifiedDrives.of(identified), []
-    if drives.times_noise is not None and drives.times_noise >= _FAR_ABOVE_NOISE:
-        found.append(
-            f"the fit ended at {drives.times_noise:,.0f} times the measurement noise, so its values compensate for "
-            "missing physics. Find it with pace diagnose before you train. [W22]"
-        )
-    if drives.at_bound:
-        found.append(
-            f"{listed(drives.at_bound, _MOST)} ended at a bound of the fit, so the value is the bound's. Widen bounds "
-            "and fit again. [W23]"
-        )
+    drives = IdentifiedDrives.of(identified)
+    found = doubts_of_fit(drives)
     if drives.undetermined:
         found.append(
             f"{listed(sorted(drives.undetermined), _MOST)} was not determined by the recordings and keeps its prior. "
             "Record a motion that shows it, or train with --randomize_identified 1. [W24]"
         )
     return found + _other_drives(cfg.scene.robot, drives)
+
+
+def doubts_of_fit(drives: IdentifiedDrives) -> list[str]:
+    """Why the values of a fit may not be the robot's, in sentences; none if all is well."""
+    found = []
+    if drives.times_noise is not None and drives.times_noise >= _FAR_ABOVE_NOISE:
+        found.append(
+            f"the fit ended at {drives.times_noise:,.0f} times the measurement noise, so its values compensate for "
+            "missing physics. Find it with pace diagnose before you use them. [W22]"
+        )
+    if drives.at_bound:
+        found.append(
+            f"{listed(drives.at_bound, _MOST)} ended at a bound of the fit, so the value is the bound's. Widen bounds "
+            "and fit again. [W23]"
+        )
+    return found
 
 
 def load_identified_cfg(drives: IdentifiedDrives) -> Any:

@@ -10,6 +10,7 @@ from pathlib import Path
 from pace_actuators import IdentifiedDrives
 from pace_actuators.files import write_atomically
 from pace_actuators.text import listed
+from pace_envs.identified import doubts_of_fit
 from pace_envs.link_inertia import NAMES
 from pace_optim.export.configs import cfg_python, isaaclab_python, mjlab_python
 from pace_optim.export.mjcf import mjcf, motors_of, pulled_notes
@@ -27,7 +28,7 @@ class Export:
     """The file's content."""
 
     notes: list[str]
-    """What the format cannot hold, in words."""
+    """Why the fit's values may not be the robot's, and what the format cannot hold."""
 
     def write(self, path: str | Path) -> None:
         """Write the file, whole or not at all."""
@@ -96,4 +97,4 @@ def export(path: str | Path, fmt: str, *, joints_only: bool = False, task: str |
     text, notes = mjcf(drives, joints_only=True) if joints_only else FORMATS[fmt](drives)
     if fmt in _OF_JOINTS:
         notes = [*notes, *pulled_notes(drives)]
-    return Export(text=text, notes=notes)
+    return Export(text=text, notes=[*doubts_of_fit(drives), *notes])

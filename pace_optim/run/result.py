@@ -14,7 +14,7 @@ import torch
 from pace_actuators import match_names, resolve_joint_values
 from pace_actuators.drive_result import ALL, CURE, DriveResult, LinkInertia
 from pace_actuators.files import refuse, write_json
-from pace_actuators.identified import DRIVE_FIELDS, RATE_FLAGS
+from pace_actuators.identified import DRIVE_FIELDS, LIMITS, RATE_FLAGS
 from pace_actuators.joint_units import JointType
 from pace_envs.link_inertia import NAMES
 from pace_envs.tasks.pace import TORQUE_OFFSET, TORQUE_SCALE
@@ -200,7 +200,10 @@ def configured_drive(problem: Problem) -> dict[str, np.ndarray]:
 
 
 def drive_in_force(problem: Problem) -> dict[str, dict[str, float]]:
-    """Gains and limits per joint that were in force in every recording; one that differed is left out."""
+    """Gains and limits per joint that were in force in every recording; one that differed is left out.
+
+    A joint that has no limit where others have one is left out too. So a limit that differed is left out of all joints.
+    """
     joints, found = list(problem.joint_names), {}
     recordings, configured = problem.dataset.recordings, configured_drive(problem)
     for name in DRIVE_FIELDS:
@@ -210,6 +213,8 @@ def drive_in_force(problem: Problem) -> dict[str, dict[str, float]]:
             for i, joint in enumerate(joints)
         }
         known = {joint: next(iter(each)) for joint, each in values.items() if len(each) == 1}
+        if name in LIMITS and len(known) < len(joints):
+            known = {}
         found[name] = {j: v for j, v in known.items() if math.isfinite(v)}
     for cfg in problem.plain_cfg.scene.robot.actuators.values():
         own = [joints[i] for group in match_names(cfg.joint_names_expr, joints) for i in group]

@@ -1,6 +1,8 @@
 """What is exported holds what was identified."""
 
 import json
+import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +17,7 @@ from pace_actuators import ActuatorActions, IdentifiedDrives, PaceDCMotor, PaceD
 from pace_actuators.drive_result import CommandTiming
 from pace_envs import load_env_cfg
 from pace_optim.export import FORMATS, export
+from pace_optim.export.configs import drive_groups
 from pace_optim.export.mjlab_native import mjlab_actuator
 from pace_optim.export.plain_drive import PlainDrive
 
@@ -53,6 +56,27 @@ def test_the_mjcf_loads_and_its_joints_hold_the_values(result):
             assert getattr(model, field)[model.joint(joint).dofadr[0]] == pytest.approx(value, rel=1e-5), (name, joint)
     assert np.allclose(model.dof_solref[6:], [2 * DT, 1.0])
     assert np.allclose(model.body_mass, original.body_mass) and np.allclose(model.body_inertia, original.body_inertia)
+
+
+def test_limits_stay_where_one_joint_has_none(result):
+    """The log of a Fetch states 14 limits, and none of its base: all were gone in every format but JSON."""
+    content = json.loads(result.read_text())
+    first, second, *_ = JOINTS
+    del content["drive"]["effort_limit"][first]
+    result.write_text(json.dumps(content))
+    (limits,) = {
+        str(each.effort_limit): each.effort_limit for each in drive_groups(IdentifiedDrives.load(result)).values()
+    }.values()
+    found = {joint: value for pattern, value in limits.items() for joint in JOINTS if re.fullmatch(pattern, joint)}
+    assert found[first] == math.inf and found[second] == 89.0
+
+
+def test_an_export_of_a_fit_that_is_not_to_be_trusted_says_so(result):
+    assert not any("[W22]" in note or "[W23]" in note for note in export(result, "json").notes)
+    content = json.loads(result.read_text()) | {"times_noise": 171.0, "at_bound": [f"friction/{JOINTS[0]}"]}
+    result.write_text(json.dumps(content))
+    notes = " ".join(export(result, "json").notes)
+    assert "171 times the measurement noise" in notes and f"friction/{JOINTS[0]} ended at a bound" in notes
 
 
 def test_the_mjcf_says_what_it_cannot_hold(result):
