@@ -34,7 +34,7 @@ PIECES, WHOLE = "pieces", "whole"
 class WayDownCfg:
     """Numbers of the stages."""
 
-    share: float = 0.25
+    share: float = 0.1
     """Share of each recording that the pieces make."""
 
     on_pieces: LeastSquaresCfg = field(
