@@ -173,6 +173,12 @@ def _between(run: RunData, label: str, value: float, factor: float) -> str:
     )
 
 
+def _beside(other: str, label: str) -> str:
+    """A parameter in words, with its joint where that is another than this one's."""
+    (name, joint), (_, own) = other.split("/"), label.split("/")
+    return in_words(name).lower() + (f" of {joint}" if joint not in (own, ALL) else "")
+
+
 def _flags(run: RunData, label: str, value: float) -> Markup:
     result, flags = run.result, []
     if label in result.at_bound:
@@ -184,6 +190,6 @@ def _flags(run: RunData, label: str, value: float) -> Markup:
         flags.append("no influence")
     for group in result.indistinguishable:
         if label in group:
-            others = [in_words(other.split("/")[0]).lower() for other in group if other != label]
+            others = [_beside(other, label) for other in group if other != label]
             flags.append("cannot be separated from " + " and ".join(dict.fromkeys(others)))
     return html('{% for flag in flags %}<span class="flag">{{ flag }}</span>{% endfor %}', flags=flags)

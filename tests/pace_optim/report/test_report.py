@@ -14,7 +14,7 @@ from pace_actuators.text import duration, value_and_error
 from pace_optim.report import write_report
 from pace_optim.report.sections import SECTIONS
 from pace_optim.report.sections.correlation import strong_pairs
-from pace_optim.report.sections.parameters import nice_ticks
+from pace_optim.report.sections.parameters import _beside, nice_ticks
 from pace_optim.report.sections.trajectories import samples_to_draw
 
 
@@ -40,6 +40,13 @@ def test_it_names_every_joint_parameter_and_error(page):
     assert "at its upper bound" in page.text and "cannot be separated from encoder bias" in page.text
     assert "resampled from 500 Hz." in page.text
     assert "scripts/fit.py --task Pace-Leg-v0" in page.text
+
+
+def test_a_value_s_look_alikes_have_their_joints():
+    """A viscous friction could not be separated "from viscous friction", that of another joint."""
+    assert _beside("viscous_friction/knee", "viscous_friction/hip") == "viscous friction of knee"
+    assert _beside("encoder_bias/hip", "viscous_friction/hip") == "encoder bias"
+    assert _beside("delay/all", "viscous_friction/hip") == "delay"
 
 
 def test_it_loads_nothing(page):
