@@ -86,10 +86,10 @@ def diagnose(
     _save(diagnosis, decisions)
     progress.close()
     on_verdict(diagnosis)
-    explains = found.verdict == "effect" or bool(found.free_form or found.on_trial)
+    explains = found.verdict == "effect" or bool(found.free_form)
     refit = explains if settings.refit is None else settings.refit
     refit = refit or (bool(wrong.wrong) and settings.refit is None)
-    for tried in (found.on_trial, found) if refit else ():
+    for tried in (None if settings.refit is False else found.on_trial, found if refit else None):
         if tried is None or not (tried.paying or wrong.wrong):
             continue
         if (path := _refit(tried, wrong, problem, run, diagnosis, progress)) is None:
