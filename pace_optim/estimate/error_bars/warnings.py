@@ -161,13 +161,11 @@ def _sampled_commands(problem: Problem, rmse: dict[str, dict[str, float]], uncer
     """Whether the drives seem to have got commands more often than they were logged.
 
     What is logged with slow samples is then early by half of the time between two commands on average: no delay that
-    is 0 or more makes up for it, and the motion has none of the steps that held commands make. A bias at its bound
-    shows another cause: the error is then not one of time.
+    is 0 or more makes up for it, and the motion has none of the steps that held commands make.
     """
     slowest = max(r.sample_stride if r.des_time is None else 1 for r in problem.dataset.recordings)
     low = problem.space.lower[problem.space["delay"]]
-    biased = any(label.startswith("encoder_bias/") for label in uncertainty.at_bound)
-    at_bound = f"delay/{GLOBAL}" in uncertainty.at_bound and float(low) == 0 and not biased
+    at_bound = f"delay/{GLOBAL}" in uncertainty.at_bound and float(low) == 0
     if slowest == 1 or not at_bound or (times_noise(problem, rmse["train"].get(ALL)) or 0.0) < FAR_ABOVE_NOISE:
         return []
     return [

@@ -274,8 +274,9 @@ class Fits:
         if now.jacobian is None or now.error is None:
             now = self.looked_at(problem, [now])[0]
         assert now.jacobian is not None and now.error is not None
-        moves, error = (each.double().square().mean(dim=(-3, -2)).sqrt() for each in (now.jacobian, now.error))
-        steps = (error / moves.clamp(min=1e-12)).clamp(self.cfg.narrow, self.cfg.wide[0]).T
+        each = (now.jacobian, now.error)
+        moves, error = (own.double().movedim(-1, 0).flatten(-2).square().mean(dim=-1).sqrt() for own in each)
+        steps = (error[:, None] / moves.clamp(min=1e-12)).clamp(self.cfg.narrow, self.cfg.wide[0])
         start = replace(Fitted.start(now.model, now.physical, tried=now.tried), steps=steps)
         return self.side_by_side(problem, [start], 1, keep_jacobian=True)[0]
 
