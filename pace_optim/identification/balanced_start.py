@@ -50,8 +50,8 @@ def balanced_start(problem: Problem) -> torch.Tensor:
     trained, links = [views[r] for r in problem.dataset.trained()], problem.env_cfg.sim2real.links
     found = _links(trained, links) if links else {}
     if found:
-        bodies = {each.link: _pseudo_inertia(each, found[each.link]) for each in links}
-        trained = [_with_bodies(view, bodies) for view in trained]
+        changes = {each.link: _change(each, found[each.link]) for each in links}
+        trained = [_changed(view, changes) for view in trained]
     seen = [(view, Links.of(view)) for view in trained]
     counts = [moving(view, links) for view, links in seen]
     joints = _judged(counts)
@@ -157,7 +157,7 @@ def _fitted(
 
     def left(values: np.ndarray) -> np.ndarray:
         own = by_link(values)
-        changes = [_pseudo_inertia(each, own[each.link]) - _pseudo_inertia(each, {}) for each in references]
+        changes = [_change(each, own[each.link]) for each in references]
         masses = [make @ change[_UPPER] for make, change in zip(makes, changes, strict=True)]
         return np.concatenate([table @ np.concatenate(masses) - torque, _PRIOR * (values - start) / spread])
 
@@ -171,26 +171,27 @@ def _places(reference: Reference) -> np.ndarray:
     return np.column_stack([com + reach * _POINTS, np.ones(len(_POINTS))])
 
 
-def _pseudo_inertia(reference: Reference, values: Mapping[str, float]) -> np.ndarray:
-    """J of a link, (4, 4); of what is not given as in the file."""
+def _change(reference: Reference, values: Mapping[str, float]) -> np.ndarray:
+    """What other values than the file's add to the J of a link, (4, 4)."""
     every = [values.get(name, value) for name, value in zip(NAMES, reference.values, strict=True)]
-    return reference.pseudo_inertia(torch.tensor(every, dtype=torch.float64)).numpy()
+    found, file = reference.pseudo_inertia(torch.tensor([every, list(reference.values)], dtype=torch.float64)).numpy()
+    return found - file
 
 
 def _of_point(view: View, links: Links, reference: Reference, u: np.ndarray) -> np.ndarray:
     """The torque of a point mass of 1 kg on a link, (N, n) [N m]."""
-    body = view.model.body(reference.link).id
-    fields = {name: torch.tensor(getattr(view.model, name)[[body]]) for name in FIELDS}
     mass = reference.values[0]
-    heavier = pseudo_inertia_of(fields)[0].numpy() + mass * np.outer(u, u)
-    return (Links.of(_with_bodies(view, {reference.link: heavier})).torque - links.torque) / mass
+    heavier = _changed(view, {reference.link: mass * np.outer(u, u)})
+    return (Links.of(heavier).torque - links.torque) / mass
 
 
-def _with_bodies(view: View, bodies: Mapping[str, np.ndarray]) -> View:
-    """A recording's view whose bodies have other pseudo-inertias, (4, 4)."""
+def _changed(view: View, changes: Mapping[str, np.ndarray]) -> View:
+    """A recording's view with something added to the J of bodies, (4, 4); its known loads stay."""
     model = copy.copy(view.model)
-    for link, j in bodies.items():
-        for name, value in fields_of(torch.tensor(j)[None]).items():
-            getattr(model, name)[model.body(link).id] = value[0].numpy()
+    for link, change in changes.items():
+        body = model.body(link).id
+        before = pseudo_inertia_of({name: torch.tensor(getattr(model, name)[[body]]) for name in FIELDS})
+        for name, value in fields_of(before + torch.tensor(change)).items():
+            getattr(model, name)[body] = value[0].numpy()
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return replace(view, model=model)

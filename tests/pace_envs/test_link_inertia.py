@@ -330,6 +330,16 @@ def test_a_fit_of_a_tool_begins_near_it(tmp_path):
     assert start["friction"]["shoulder"] == pytest.approx(0.1, rel=0.5)
 
 
+def test_a_known_load_stays_where_a_fit_of_its_link_begins(tmp_path):
+    true = {"fore": reference("fore").inertia({"link_mass": 0.92})}
+    known = Load(added_mass={"fore": 0.6}, added_mass_at={"fore": (0.0, 0.0, -0.25)})
+    problem = make_problem(recorded(tmp_path, true, known, noise=1e-4), cfg=arm_cfg(tmp_path, ["fore@mass"]))
+    start = problem.space.to_dict(problem.space.to_physical(balanced_start(problem)))
+    assert start["link_mass"]["fore"] == pytest.approx(0.92, rel=0.1)
+    assert start["armature"]["elbow"] == pytest.approx(0.02, rel=0.5)
+    assert start["friction"]["elbow"] == pytest.approx(0.1, rel=0.5)
+
+
 def test_a_fit_of_two_wrong_links_begins_near_them(tmp_path):
     true = {
         "upper": reference("upper").inertia({"link_mass": 1.8}),
