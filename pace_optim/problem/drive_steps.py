@@ -77,7 +77,7 @@ def set_drive_step(cfg: PaceSim2realEnvCfg, env: ManagerBasedRLEnv | None = None
     Returns:
         The step [s]; ``None`` if the present one is fine enough. A search may take the present one: it is stable.
     """
-    steps = cfg.sim2real.physics_steps
+    steps = math.ceil(cfg.sim2real.physics_steps / cfg.decimation)  # of a control step; a drive's rate has made some
     if any(drive.implicit for drive in cfg.scene.robot.actuators.values()):
         cfg.sim.integrator, cfg.scene.num_envs = "leapfrog", 1
         own = env or ManagerBasedRLEnv(cfg)

@@ -62,6 +62,14 @@ def test_any_rate_finds_a_physics_step_that_fits_it(drive_dt, physics_dt):
     assert torch.allclose(rollout.positions(steps), stepped, atol=1e-12)  # the compiled drive has the same clock
 
 
+def test_a_rate_of_drives_counts_among_the_physics_steps_of_a_control_step():
+    """Each step that the rate asked for was divided again: a robot from a file took 0.125 ms."""
+    cfg = env_cfg()
+    cfg.sim2real.physics_steps = 4
+    assert load_problem(BENCH, env_cfg=cfg).physics_dt == pytest.approx(0.000625)
+    assert load_problem(BENCH, env_cfg=cfg, drive_dt=0.001).physics_dt == pytest.approx(0.0005)
+
+
 def test_a_rate_that_is_no_time_is_refused():
     with pytest.raises(ValueError, match=r"drive_dt is -0\.001, expected seconds, or 0"):
         FitSettings(task=BENCH, drive_dt=-0.001)
