@@ -119,6 +119,10 @@ class Articulation(RobotState):
         self._links.add_load(ids, mass, place, rows)
         self._sim.constants_changed()
 
+    def pseudo_inertias(self) -> dict[tuple[int, int], torch.Tensor]:
+        """Of the bodies that joints move, {(body, joint): (num_envs, 4, 4)}, by index."""
+        return self._links.pseudo_inertias()
+
     def write_link_parameter_to_sim(self, references: Sequence[Reference], name: str, values: torch.Tensor) -> None:
         """Write an inertial parameter of links.
 

@@ -241,6 +241,12 @@ class LinkInertias:
         self._remember()
         return Link(inertias=self, rows=rows, joint=joint)
 
+    def pseudo_inertias(self) -> dict[tuple[int, int], torch.Tensor]:
+        """Of the bodies that joints move, {(body, joint): (num_envs, 4, 4)}, by index."""
+        pairs = [(body, joint) for joint in range(len(self._joints)) for body in self.bodies_of(joint)]
+        live = {field: self.sim.expand(field).double() for field in FIELDS}
+        return {at: pseudo_inertia_of({field: live[field][:, at[0]] for field in FIELDS}) for at in pairs}
+
     def bodies_of(self, joint: int) -> list[int]:
         """The joint's body and all that are fixed to it."""
         model, body = self.sim.model, int(self._joints[joint].bodyid[0])

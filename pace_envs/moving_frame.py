@@ -81,9 +81,28 @@ def bias_in_frame(model: mujoco.MjModel, state: FrameState, motion: np.ndarray, 
     Returns:
         (B, nv) [N m, of slides N].
     """
+    velocity, acceleration = motion_of_bodies(model, state, motion, point)
+    pushed = np.zeros_like(velocity)
+    for body in range(1, model.nbody):
+        inertia = state.cinert[:, body]
+        momentum = _times_inertia(inertia, velocity[:, body])
+        pushed[:, body] = _times_inertia(inertia, acceleration[:, body]) + _force_product(velocity[:, body], momentum)
+    for body in range(model.nbody - 1, 0, -1):
+        if parent := int(model.body_parentid[body]):
+            pushed[:, parent] += pushed[:, body]
+    return np.einsum("bji,bji->bj", state.cdof, pushed[:, model.dof_bodyid])
+
+
+def motion_of_bodies(
+    model: mujoco.MjModel, state: FrameState, motion: np.ndarray, point: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Spatial velocities and accelerations of all bodies without joint accelerations, (B, nbody, 6) each.
+
+    They are of points at the centre of mass of a body's tree, in the world's axes, the rotation first, as MuJoCo's
+    ``cvel``; gravity is in the accelerations. Arguments as for :func:`bias_in_frame`.
+    """
     rotation, turning, force = motion[:, :3], motion[:, 3:6], motion[:, 6:]
-    size = len(motion), model.nbody, 6
-    velocity, acceleration, pushed = state.cvel.copy(), np.zeros(size), np.zeros(size)
+    velocity, acceleration = state.cvel.copy(), np.zeros((len(motion), model.nbody, 6))
     for body in range(1, model.nbody):
         parent, first, count = (int(each[body]) for each in (model.body_parentid, model.body_dofadr, model.body_dofnum))
         arm = state.subtree_com[:, int(model.body_rootid[body])] - point
@@ -96,13 +115,7 @@ def bias_in_frame(model: mujoco.MjModel, state: FrameState, motion: np.ndarray, 
         for dof in range(first, first + count):
             change = state.cdof_dot[:, dof] + _motion_product(frame, state.cdof[:, dof])
             acceleration[:, body] += change * state.qvel[:, dof, None]
-        inertia = state.cinert[:, body]
-        momentum = _times_inertia(inertia, velocity[:, body])
-        pushed[:, body] = _times_inertia(inertia, acceleration[:, body]) + _force_product(velocity[:, body], momentum)
-    for body in range(model.nbody - 1, 0, -1):
-        if parent := int(model.body_parentid[body]):
-            pushed[:, parent] += pushed[:, body]
-    return np.einsum("bji,bji->bj", state.cdof, pushed[:, model.dof_bodyid])
+    return velocity, acceleration
 
 
 def _times_inertia(inertia: np.ndarray, v: np.ndarray) -> np.ndarray:

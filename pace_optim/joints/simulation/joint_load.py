@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from types import MappingProxyType
 
 import mujoco
 import numpy as np
@@ -12,8 +14,13 @@ import torch
 from pace_envs import ManagerBasedEnv
 from pace_envs.closed_loops import ClosedLoops
 from pace_envs.motor_coordinates import MotorCoordinates
-from pace_envs.moving_frame import FrameState, bias_in_frame
+from pace_optim.joints.simulation.link_states import LinkChange, LinkStates
 from pace_optim.recording.moving_base import Carried
+
+Parameter = tuple[str, str]
+"""An effect on the model, and one of its parameters."""
+_AT_ONCE = 4096
+"""Control steps whose states are kept together."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -26,6 +33,17 @@ class JointLoad:
     """Torque of gravity, of springs, and of the other joints' motion [N m]."""
     load: torch.Tensor
     """The same without what the other joints' accelerations do: the load that a robot's drives get [N m]."""
+
+    @classmethod
+    def empty(cls, shape: Sequence[int]) -> JointLoad:
+        """Room for (T, R, n)."""
+        inertia, torque, load = (torch.empty(*shape, dtype=torch.float64) for _ in range(3))
+        return cls(inertia=inertia, torque=torque, load=load)
+
+    def put(self, at: tuple[slice, int], felt: Sequence[np.ndarray]) -> None:
+        """Write inertia, torque and load of a part."""
+        for own, value in zip((self.inertia, self.torque, self.load), felt, strict=True):
+            own[at] = torch.from_numpy(value)
 
     def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> JointLoad:
         """The same change of each."""
@@ -90,6 +108,12 @@ class Motion:
         frame = None if self.frame is None else self.frame[::steps]
         return replace(self, qpos=self.qpos[::steps], qvel=self.qvel[::steps], qacc=self.qacc[::steps], frame=frame)
 
+    def course(self, at: tuple[slice, int]) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """How the frame moves in a part of a recording, (T', 9), and the point (3,)."""
+        if self.frame is None or self.point is None:
+            return None, None
+        return self.frame[at].numpy(), self.point[at[1]].numpy()
+
     def moved(self, by: torch.Tensor) -> Motion:
         """With other positions, by (T, R, nq)."""
         return replace(self, qpos=self.qpos + by)
@@ -109,49 +133,46 @@ class Links:
 
     @classmethod
     def of(cls, env: ManagerBasedEnv) -> Links:
-        """Of an environment as it is, without the drives' armature and viscous friction."""
+        """Of an environment as it is, without the drives' armature and friction, and without constraints."""
         robot = env.scene["robot"]
         columns = robot.dof_columns.numpy()
         env.sim.forward()
         models = [env.sim.batch.get_model(r, None) for r in range(env.num_envs)]
         turn = env.sim.coordinates
         for model in models:
-            model.dof_armature[columns] = model.dof_damping[columns] = 0.0
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+            model.dof_armature[columns] = model.dof_damping[columns] = model.dof_frictionloss[columns] = 0.0
             for field, carried in ({} if turn is None else turn.carried).items():
                 getattr(model, f"dof_{field}")[carried.columns] = carried.own
-        return cls(models=models, columns=columns, loops=robot.closed_loops, coordinates=env.sim.coordinates)
+        return cls(models=models, columns=columns, loops=robot.closed_loops, coordinates=turn)
 
-    def feel(self, motion: Motion) -> JointLoad:
-        """Inertia of each joint, and the torque that the rest of the robot leaves on it.
+    def feel(
+        self, motion: Motion, changes: Mapping[Parameter, LinkChange] = MappingProxyType({})
+    ) -> tuple[JointLoad, dict[Parameter, JointLoad]]:
+        """Inertia of each joint, and the torque that the rest of the robot leaves on it; and how changes change these.
 
         With the speeds of all degrees of freedom v = T v_d of those of the driven joints, bias b and passive torques s
         (springs, viscous and Coulomb friction of joints without drives):
 
             I_j = (T' M T)_jj,    f_j = I_j a_j - [T' (M a + b - s)]_j
+
+        Args:
+            motion: Of T intervals.
+            changes: What a unit of effects' parameters changes of links.
         """
         shape = (*motion.qpos.shape[:2], len(self.columns))
-        inertia, torque, load = (np.empty(shape) for _ in range(3))
+        felt = JointLoad.empty(shape)
+        changed = {key: JointLoad.empty(shape) for key in changes}
         qpos, qvel, qacc = (each.numpy() for each in self._of_joints(motion))
+        own = motion.qacc[..., self.columns].numpy()
         for r, model in enumerate(self.models):
-            data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
-            carried, friction = self._carried(model, motion, r), model.dof_frictionloss.copy()
-            friction[self.columns] = 0.0
-            for k in range(shape[0]):
-                data.qpos[:], data.qvel[:] = qpos[k, r], qvel[k, r]
-                mujoco.mj_fwdPosition(model, data)
-                mujoco.mj_fwdVelocity(model, data)
-                mujoco.mj_fullM(model, data, mass)
-                bias = data.qfrc_bias if carried is None else carried[k]
-                missing = mass @ qacc[k, r] + bias - data.qfrc_passive + friction * np.sign(qvel[k, r])
-                load[k, r] = -self._efforts(bias)[self.columns]
-                if (follow := self.following(data.qpos)) is None:
-                    inertia[k, r], missing = mass.diagonal()[self.columns], missing[self.columns]
-                else:
-                    inertia[k, r], missing = np.einsum("ij,ik,kj->j", follow, mass, follow), follow.T @ missing
-                torque[k, r] = inertia[k, r] * motion.qacc[k, r, self.columns].numpy() - missing
-        return JointLoad(
-            inertia=torch.from_numpy(inertia), torque=torch.from_numpy(torque), load=torch.from_numpy(load)
-        )
+            for first in range(0, shape[0], _AT_ONCE):
+                at = slice(first, first + _AT_ONCE), r
+                states = LinkStates.of(model, qpos[at], qvel[at], qacc[at], self.following, *motion.course(at))
+                felt.put(at, states.feel(self._direct, own[at]))
+                for key, change in changes.items():
+                    changed[key].put(at, states.change(change[r], self._direct, own[at]))
+        return felt, changed
 
     def _of_joints(self, motion: Motion) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """MuJoCo's own positions (T, R, nq), speeds and accelerations (T, R, nv) of a motion."""
@@ -164,33 +185,17 @@ class Links:
             turn.speeds_of_joints(motion.qacc),
         )
 
-    def _efforts(self, bias: np.ndarray) -> np.ndarray:
-        """Torques (nv,) in the columns of motors, of MuJoCo's."""
-        return bias if self.coordinates is None else self.coordinates.efforts_of_motors(torch.from_numpy(bias)).numpy()
+    @cached_property
+    def _direct(self) -> np.ndarray:
+        """How speeds follow from the drives' where nothing else does, (nv, n)."""
+        every = torch.eye(self.models[0].nv, dtype=torch.float64)
+        turn = self.coordinates
+        driven = every if turn is None else turn.of_driven(every, turn.columns).T
+        return driven[:, self.columns].numpy()
 
-    def following(self, qpos: np.ndarray) -> np.ndarray | None:
-        """How all speeds follow from the drives' at a posture (nq,), (nv, n); ``None``: each is its joint's."""
-        if self.loops is None and self.coordinates is None:
-            return None
-        every = np.eye(self.models[0].nv) if self.loops is None else self.loops.following(qpos)
-        if self.coordinates is None:
-            return every[:, self.columns]
-        driven = self.coordinates.of_driven(torch.eye(len(every), dtype=torch.float64), self.coordinates.columns)
-        return (every @ driven.numpy().T)[:, self.columns]
-
-    def _carried(self, model: mujoco.MjModel, motion: Motion, r: int) -> np.ndarray | None:
-        """Forces of a recording's motion in the frame of a base that moves, (T, nv); ``None`` where it rests."""
-        if motion.frame is None or motion.point is None:
-            return None
-        count, data = len(motion.qpos), mujoco.MjData(model)
-        state = FrameState.empty(model, count)
-        qpos, qvel, _ = self._of_joints(motion)
-        for k in range(count):
-            data.qpos[:], data.qvel[:] = qpos[k, r].numpy(), qvel[k, r].numpy()
-            mujoco.mj_fwdPosition(model, data)
-            mujoco.mj_fwdVelocity(model, data)
-            state.keep(k, data)
-        return bias_in_frame(model, state, motion.frame[:, r].numpy(), motion.point[r].numpy())
+    def following(self, qpos: np.ndarray) -> np.ndarray:
+        """How all speeds follow from the drives' at a posture (nq,), (nv, n)."""
+        return self._direct if self.loops is None else self.loops.following(qpos) @ self._direct
 
     def shifts(self, motion: Motion, joints: Sequence[int], by: float) -> torch.Tensor:
         """What moves when some of the driven joints move, one of each tree, (T, R, nq)."""
@@ -206,7 +211,6 @@ class Links:
             for r in range(result.shape[1]):
                 moved[:] = qpos[k, r]
                 follow = self.following(moved)
-                assert follow is not None  # there are loops
                 step[:] = by * follow[:, list(joints)].sum(axis=1)
                 mujoco.mj_integratePos(model, moved, step, 1.0)
                 result[k, r] = torch.from_numpy(moved) - qpos[k, r]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,8 @@ from scipy import fft, optimize
 
 from pace_actuators.effects import EffectCfg, effect_cfgs, get_effect, probe_points
 from pace_envs.tasks.pace import GLOBAL
-from pace_optim.joints.simulation.joint_load import JointLoad, Links, LoadChange, Motion
+from pace_optim.joints.simulation.joint_load import JointLoad, Links, LoadChange, Motion, Parameter
+from pace_optim.joints.simulation.link_states import LinkChange
 from pace_optim.problem.free_phases import FreePhases
 from pace_optim.problem.problem import Problem
 from pace_optim.recording import Recording
@@ -316,26 +317,24 @@ def _along(
         evaluator = problem.evaluator()
         own = {p.name: {key: values[p.name][key] for key in p.keys} for p in problem.space.parameters}
         phases = evaluator.free_phases(problem.space.from_dict(own)).of_single_joints()
-    links = Links.of(rollout.env)
-    whole = feel = links.feel(motion)
-    whole_stiffness = torch.zeros_like(whole.torque)
-    for moved in _one_of_each_tree(problem):
-        whole_stiffness[..., moved] = _stiffness(links, motion, whole, moved)
-    stiffness = whole_stiffness
-    changes = {}
-    for name in model_effects:
-        for parameter in get_effect(name).parameters:
-            now = torch.tensor(list(values[f"{name}.{parameter.name}"].values()), dtype=torch.float64)
-            change = _change(problem, rollout, name, parameter.name, now, motion, whole, whole_stiffness)
-            feel = feel.less(change, now)  # each twin has its own part of the effect itself; its neighbours' stays
-            stiffness = stiffness - now * change.stiffness
-            changes[name, parameter.name] = change
+    now = {
+        (name, parameter.name): torch.tensor([*values[f"{name}.{parameter.name}"].values()], dtype=torch.float64)
+        for name in model_effects
+        for parameter in get_effect(name).parameters
+    }
+    links, changes = Links.of(rollout.env), {key: _link_change(rollout, *key, own) for key, own in now.items()}
+    feel, felt = links.feel(motion, changes)
+    stiffness, stiffer = _stiffness(problem, links, motion, feel, felt, changes)
+    load_changes = {}
+    for key, has in now.items():  # each twin has its own part of an effect itself; its neighbours' stays
+        change = load_changes[key] = LoadChange(**vars(felt[key]), stiffness=stiffer[key])
+        feel, stiffness = feel.less(change, has), stiffness - has * change.stiffness
     rollout.env.close()
     return ReferencePath(
         position=positions[..., rollout.robot.qpos_columns],
         feel=feel,
         stiffness=stiffness,
-        model_effects=changes,
+        model_effects=load_changes,
         columns=rollout.robot.dof_columns,
         names=tuple(rollout.robot.joint_names),
         control_dt=problem.control_dt,
@@ -375,16 +374,26 @@ def _on_all_joints(
     return problem.with_effects([*others, *(EffectCfg(effect=effect) for effect in effects)]), values
 
 
-def _stiffness(links: Links, motion: Motion, feel: JointLoad, joints: Sequence[int]) -> torch.Tensor:
-    """Derivative of f_j - M_j a_j by the joint's own position of joints of which none moves another, (T, R, joints)."""
-    steps, motion, at = (
-        len(motion.qpos),
-        motion.every(_STIFFNESS_EVERY),
-        feel.map(lambda each: each[::_STIFFNESS_EVERY]),
-    )
-    there = links.feel(motion.moved(links.shifts(motion, joints, _STEP)))
-    change = (there.torque - at.torque) - (there.inertia - at.inertia) * motion.qacc[..., links.columns]
-    return (change[..., joints] / _STEP).repeat_interleave(_STIFFNESS_EVERY, dim=0)[:steps]
+def _stiffness(
+    problem: Problem,
+    links: Links,
+    motion: Motion,
+    feel: JointLoad,
+    felt: Mapping[Parameter, JointLoad],
+    changes: Mapping[Parameter, LinkChange],
+) -> tuple[torch.Tensor, dict[Parameter, torch.Tensor]]:
+    """Derivative of f_j - M_j a_j by each joint's own position, and how changes change it, (T, R, n) each."""
+    steps, motion = len(motion.qpos), motion.every(_STIFFNESS_EVERY)
+    stiffness = torch.empty_like(feel.torque)
+    stiffer = {key: torch.empty_like(stiffness) for key in changes}
+    for moved in _one_of_each_tree(problem):
+        there, others = links.feel(motion.moved(links.shifts(motion, moved, _STEP)), changes)
+        every = [(stiffness, feel, there), *((stiffer[key], felt[key], others[key]) for key in changes)]
+        for result, here, each in every:
+            before = here.map(lambda own: own[::_STIFFNESS_EVERY])
+            change = each.torque - before.torque - (each.inertia - before.inertia) * motion.qacc[..., links.columns]
+            result[..., moved] = (change[..., moved] / _STEP).repeat_interleave(_STIFFNESS_EVERY, dim=0)[:steps]
+    return stiffness, stiffer
 
 
 def _one_of_each_tree(problem: Problem) -> Iterator[list[int]]:
@@ -394,34 +403,17 @@ def _one_of_each_tree(problem: Problem) -> Iterator[list[int]]:
         yield [names.index(tree[i]) for tree in problem.trees if i < len(tree)]
 
 
-def _change(
-    problem: Problem,
-    rollout: Rollout,
-    effect: str,
-    parameter: str,
-    now: torch.Tensor,
-    motion: Motion,
-    whole: JointLoad,
-    stiffness: torch.Tensor,
-) -> LoadChange:
-    """What a unit of a parameter of an effect on the model changes of each joint's own feel.
+def _link_change(rollout: Rollout, effect: str, parameter: str, now: torch.Tensor) -> LinkChange:
+    """What a unit of a parameter of an effect on the model changes of the links that joints carry.
 
-    Measured between what the joint has, ``now`` (n,), and null, or where it has null, a probe.
+    Measured between what each joint has, ``now`` (n,), and null, or where it has null, a probe.
     """
     robot = rollout.robot
     probe = torch.full_like(now, probe_points(get_effect(effect))[0][parameter])
     other = torch.where(now == 0, probe, 0.0)
-    fields = {"inertia": whole.inertia, "torque": whole.torque, "load": whole.load, "stiffness": stiffness}
-    changes = {field: torch.zeros_like(value) for field, value in fields.items()}
-    for moved in _one_of_each_tree(problem):
-        values = now.clone()
-        values[moved] = other[moved]
-        robot.write_effect_parameter_to_sim(effect, parameter, values.expand(robot.num_envs, -1))
-        links = Links.of(rollout.env)
-        felt = links.feel(motion)
-        there = vars(felt) | {"stiffness": torch.zeros_like(stiffness)}
-        there["stiffness"][..., moved] = _stiffness(links, motion, felt, moved)
-        for field, value in fields.items():
-            changes[field][..., moved] = ((there[field] - value) / (other - now))[..., moved]
+    here = robot.pseudo_inertias()
+    robot.write_effect_parameter_to_sim(effect, parameter, other.expand(robot.num_envs, -1))
+    there = robot.pseudo_inertias()
     robot.write_effect_parameter_to_sim(effect, parameter, now.expand(robot.num_envs, -1))
-    return LoadChange(**changes)
+    by = (other - now).tolist()
+    return [{at: ((there[at][r] - here[at][r]) / by[at[1]]).numpy() for at in here} for r in range(robot.num_envs)]
