@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ from pace_actuators.base_parameters import BASE_PARAMETERS
 from pace_actuators.drive_result import ALL
 from pace_actuators.effects import Effect
 from pace_actuators.effects.command import GravityCompensation
-from pace_actuators.effects.fading_friction import SoftFriction
 from pace_actuators.text import listed
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.identified import load_identified_cfg, use_identified
@@ -31,6 +30,7 @@ from pace_optim.export.plain_drive import (
     effect_notes,
     is_undetermined,
     plain_drives,
+    soft_frictions,
 )
 
 _BODY_FIELDS = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat")
@@ -67,10 +67,9 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
                 _set(joint, parameter.mujoco, drives.values(parameter.name, [name])[name])
         joint.actfrcrange = [0.0, 0.0]  # none: the drive has its limit
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-    for name, time_constant in _soft_frictions(drives, robot.joint_names).items():
+    for name, (constant, impedance) in soft_frictions(drives).items():
         joint = _carrier(spec, name)
-        joint.solref_friction = [time_constant, 1.0]
-        joint.solimp_friction = [SoftFriction.impedance, SoftFriction.widest, 0.001, 0.5, 2.0]
+        joint.solref_friction, joint.solimp_friction = [constant, 1.0], [impedance, impedance, 0.001, 0.5, 2.0]
     if spec.meshes:
         spec.meshdir = str((source.parent / spec.meshdir).resolve())
     changed = _write_bodies(spec, plain, env)
@@ -188,14 +187,7 @@ def _exclude_overlaps(spec: mujoco.MjSpec, source: Path) -> list[str]:
 
 
 def _in_the_model(kind: type[Effect]) -> bool:
-    return kind is SoftFriction or kind.overrides("write_model")
-
-
-def _soft_frictions(drives: IdentifiedDrives, joint_names: Sequence[str]) -> dict[str, float]:
-    """Time constants [s] of the joints whose friction is that of MuJoCo's own constraint."""
-    own = [cfg.joints(joint_names) for cfg in drives.effects if cfg.effect_class is SoftFriction]
-    values = drives.values("soft_friction.time_constant", own[0]) if own else {}
-    return {name: value for name, value in values.items() if value > 0}
+    return kind.overrides("constraint") or kind.overrides("write_model")
 
 
 def _set(joint: Any, attribute: str, value: float) -> None:

@@ -6,9 +6,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import torch
+
 from pace_actuators import IdentifiedDrives
 from pace_actuators.drive_result import ALL
 from pace_actuators.effects import Effect
+from pace_actuators.effects.fading_friction import SoftFriction, solver_parameters
 from pace_actuators.joint_values import resolve_joint_values
 from pace_actuators.representable import of_the_recording
 from pace_optim.export.configs import drive_groups
@@ -158,6 +161,17 @@ def plain_drives(drives: IdentifiedDrives) -> tuple[dict[str, PlainDrive], list[
             "actuator delays commands, which is another physics."
         )
     return {joint: result[joint] for joint in drives.joint_names if joint in result}, notes
+
+
+def soft_frictions(drives: IdentifiedDrives) -> dict[str, tuple[float, float]]:
+    """Time constant [s] and impedance of MuJoCo's friction constraint, of joints whose friction is soft.
+
+    They are for the identification's step: MuJoCo's constraint takes a speed half a step older than the fit's.
+    """
+    own = {joint: each for joint, each in _of_effect(drives, SoftFriction.name).items() if each > 0}
+    parameters = solver_parameters(torch.tensor(list(own.values()), dtype=torch.float64), drives.at.physics_dt)
+    constants, impedances = (each.tolist() for each in parameters)
+    return dict(zip(own, zip(constants, impedances, strict=True), strict=True))
 
 
 def effect_notes(drives: IdentifiedDrives, held: Sequence[str]) -> list[str]:

@@ -116,6 +116,17 @@ def test_frictions_of_joints_that_push_each_other_settle_as_in_the_environment()
     assert apart(problem, problem.space.from_dict({**TRUTH, "friction": 3.0})) < 1e-9
 
 
+@pytest.mark.parametrize("where", ["", "@.*KFE"], ids=["all", "beside hard ones"])
+def test_soft_friction_is_the_environment_s(where):
+    cfg = env_cfg(ANYMAL)
+    problem = make_problem(record(legs_chirp(cfg, 0.3), TRUTH, cfg=cfg), cfg=cfg).with_physics_dt(DT / 2)
+    soft, values = with_effects(problem, [f"soft_friction{where}"])
+    values = soft.space.from_dict({**TRUTH, "friction": 3.0, "soft_friction.time_constant": 0.02})
+    assert apart(soft, values) < 1e-9
+    hard = problem.evaluator().residuals(problem.space.from_dict({**TRUTH, "friction": 3.0})[None]).error
+    assert float((hard - soft.evaluator().residuals(values[None]).error).abs().max()) > 1e-4
+
+
 def test_drives_in_several_groups_whose_joints_are_not_in_the_model_s_order():
     cfg = env_cfg(ANYMAL)
     robot = cfg.scene.robot

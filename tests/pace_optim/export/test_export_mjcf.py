@@ -155,6 +155,18 @@ def test_effects_that_a_joint_or_a_body_holds_move_the_model_as_in_the_identific
         assert "stiffness" not in joint and "quadratic_friction (τ - b2 v |v|): omitted" in " ".join(newton.notes)
 
 
+def test_soft_friction_moves_the_model_as_in_the_identification(tmp_path):
+    result = without_effects(write_result(tmp_path / "result.json", delay=3.0))
+    content = json.loads(result.read_text())
+    values = {"friction": dict.fromkeys(JOINTS, 3.0), "soft_friction.time_constant": dict.fromkeys(JOINTS, 0.02)}
+    changed(result, effects=["soft_friction"], parameters=content["parameters"] | values)
+    targets = 0.1 * chirp(len(JOINTS))
+    expected, _ = identified_motion(result, targets)
+    found = replay(fixed_in_the_air(export(result, "mjcf").text), JOINTS, targets, targets[0])
+    bare = replay(fixed_in_the_air(export(without_effects(result), "mjcf").text), JOINTS, targets, targets[0])
+    assert np.abs(found - expected).max() < 5e-5 < 0.03 * np.abs(bare - expected).max()
+
+
 def test_the_actuators_give_the_drives_torque(result):
     """To 1e-5 of the root mean square torque, on one random sequence; gains and limits with the effects on them."""
     path = changed(result, effects=["torque_gain"], delay_s=0.0)
