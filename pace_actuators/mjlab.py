@@ -30,7 +30,7 @@ from mjlab.managers.event_manager import EventTermCfg, requires_model_fields
 from mjlab.utils.spec import create_motor_actuator, get_non_free_joints
 
 from pace_actuators.actions import ActuatorActions
-from pace_actuators.effects.fading_friction import solver_parameters
+from pace_actuators.effects.fading_friction import solver_parameters, step_of_constraint
 from pace_actuators.identified import IdentifiedDrives
 from pace_actuators.pace_dc_motor import PaceDCMotor
 from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
@@ -154,7 +154,7 @@ class PaceDCMotorActuator(Actuator):  # type: ignore[misc]
         solimp = torch.tensor([[impedance, impedance, 0.001, 0.5, 2.0]], device=device).repeat(len(self._dofs), 1)
         if soft is not None:  # the same in all environments
             own = (soft[0] > 0).nonzero()[:, 0]
-            constants, impedances = solver_parameters(soft[0, own], dt)
+            constants, impedances = solver_parameters(*step_of_constraint(soft[0, own], dt))
             solref[own, 0], solimp[own, :2] = constants, impedances[:, None]
         for field, value in (("dof_solref", solref), ("dof_solimp", solimp)):
             getattr(mj_model, field)[self._dofs.cpu().numpy()] = value.cpu().numpy()

@@ -315,7 +315,7 @@ class Simulation:
 
     def _write_softness(self, solref: str, solimp: str, which: torch.Tensor | slice, time: torch.Tensor) -> None:
         """Write the solver parameters of frictions, (num_envs, …) [s]; hard ones have those of the model."""
-        constant, impedance = solver_parameters(time, self.cfg.dt)
+        constant, impedance = solver_parameters(*step_of_constraint(time, self.cfg.dt))
         for field, value, width in ((solref, constant, 1), (solimp, impedance, 2)):
             hard = self.tensor(getattr(self.model, field))[which, :width]
             self.expand(field)[:, which, :width] = torch.where((time > 0)[..., None], value[..., None], hard)

@@ -36,14 +36,13 @@ def step_of_constraint(time_constant: torch.Tensor, dt: float) -> tuple[torch.Te
     return 2 / longer, (1 - IMPEDANCE) / IMPEDANCE * time / longer
 
 
-def solver_parameters(time_constant: torch.Tensor, dt: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """What MuJoCo is to be given for steps of h [s]: the time constant of ``solreffriction``, and the impedance.
+def solver_parameters(rate: torch.Tensor, softness: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """What MuJoCo is to be given for b' and ρ': the time constant of ``solreffriction`` [s], and the impedance.
 
     Args:
-        time_constant: T [s].
-        dt: h [s].
+        rate: b' [1/s].
+        softness: ρ'.
     """
-    rate, softness = step_of_constraint(time_constant, dt)
     impedance = 1 / (1 + softness)
     return 2 / (impedance * rate), impedance
 

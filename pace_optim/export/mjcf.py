@@ -67,15 +67,14 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
                 _set(joint, parameter.mujoco, drives.values(parameter.name, [name])[name])
         joint.actfrcrange = [0.0, 0.0]  # none: the drive has its limit
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-    for name, (constant, impedance) in soft_frictions(drives).items():
-        joint = _carrier(spec, name)
-        joint.solref_friction, joint.solimp_friction = [constant, 1.0], [impedance, impedance, 0.001, 0.5, 2.0]
     if spec.meshes:
         spec.meshdir = str((source.parent / spec.meshdir).resolve())
     changed = _write_bodies(spec, plain, env)
+    weights = dict(zip(robot.joint_names, env.sim.friction_weights(robot.dof_columns)[0].tolist(), strict=True))
     env.close()
     plain.close()
     held = [e.effect_class.name for e in drives.effects if _in_the_model(e.effect_class)]
+    actuators: dict[str, PlainDrive] = {}
     if joints_only:
         notes = _notes_of_joints(drives)
     else:
@@ -84,6 +83,7 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
         notes += more
         notes += write_drives(spec, actuators, drives.at.physics_dt, couplings)
         held += [*GAIN_EFFECTS, *JOINT_EFFECTS, *_compensated(spec, drives, notes)]
+    _write_soft_friction(spec, source, drives, weights, actuators)
     if changed:
         notes.append(f"changed rigid bodies, which are in the model: {', '.join(changed)}.")
     notes += [*effect_notes(drives, held), *left_out]
@@ -150,6 +150,44 @@ def _in_plain_steps(
     if least:
         notes.append(f"armature or kd of {', '.join(least)} would be below 0: it is 0, and the motion differs.")
     return result, notes
+
+
+def _write_soft_friction(
+    spec: mujoco.MjSpec,
+    source: Path,
+    drives: IdentifiedDrives,
+    weights: Mapping[str, float],
+    actuators: Mapping[str, PlainDrive],
+) -> None:
+    """Write the solver parameters of soft frictions, which follow the armatures and dampings of the file.
+
+    Args:
+        spec: The model with its drives; it is changed.
+        source: The model's own file.
+        drives: What was identified.
+        weights: What a torque on each joint accelerates it by there [1 / kg m²].
+        actuators: The drives in the file.
+    """
+    if not soft_frictions(drives):
+        return
+    fixed, dt = spec.copy(), drives.at.physics_dt
+    for joint in [each for each in fixed.joints if each.type == mujoco.mjtJoint.mjJNT_FREE]:
+        fixed.delete(joint)  # the base is held in the fit
+    for each in [*fixed.keys, *fixed.sensors]:
+        fixed.delete(each)
+    model = compile_model(fixed, source)
+    scales, late = {}, {}
+    takes_slopes = spec.option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    for name, weight in weights.items():
+        of_joint = spec.joint(name) is not None
+        own = model.dof_invweight0[model.joint(name).dofadr[0]] if of_joint else model.tendon(name).invweight0
+        scales[name] = float(np.ravel(own)[0]) / weight
+        damping = float(np.ravel(_carrier(spec, name).damping)[0]) if of_joint else 0.0  # a tendon's acts explicitly
+        damping += actuators[name].damping if takes_slopes and name in actuators else 0.0
+        late[name] = dt * damping * scales[name] * weight
+    for name, (constant, impedance) in soft_frictions(drives, scales, late).items():
+        joint = _carrier(spec, name)
+        joint.solref_friction, joint.solimp_friction = [constant, 1.0], [impedance, impedance, 0.001, 0.5, 2.0]
 
 
 def _carrier(spec: mujoco.MjSpec, name: str) -> Any:

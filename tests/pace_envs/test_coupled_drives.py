@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from pace_actuators import PaceDCMotorCfg
-from pace_actuators.effects.fading_friction import solver_parameters
+from pace_actuators.effects.fading_friction import solver_parameters, step_of_constraint
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.from_model import cfg_from_model
 from pace_envs.motor_coordinates import DrivenJoints
@@ -83,7 +83,7 @@ def test_motors_move_as_tendons_of_plain_mujoco(case, soft, tmp_path):
     model.tendon_frictionloss[:], model.tendon_solref_fri[:] = case.truth["friction"], (2e-3, 1.0)
     model.tendon_solimp_fri[:] = (0.999, 0.999, 0.001, 0.5, 2.0)
     if soft:
-        constant, impedance = solver_parameters(torch.tensor(soft).double(), 1e-3)
+        constant, impedance = solver_parameters(*step_of_constraint(torch.tensor(soft).double(), 1e-3))
         model.tendon_solref_fri[:, 0], model.tendon_solimp_fri[:, :2] = float(constant), float(impedance)
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION | mujoco.mjtDisableBit.mjDSBL_CONTACT
