@@ -22,6 +22,7 @@ from pace_envs.identified import load_identified_cfg, use_identified
 from pace_envs.model_file import compile_model, missing_files, read_model_file
 from pace_envs.motor_coordinates import DrivenJoints, add_motors
 from pace_envs.robot_spec import load_robot_spec
+from pace_optim.export.configs import drive_groups
 from pace_optim.export.mjcf_drives import write_drives
 from pace_optim.export.plain_drive import (
     GAIN_EFFECTS,
@@ -161,6 +162,8 @@ def _write_soft_friction(
 ) -> None:
     """Write the solver parameters of soft frictions, which follow the armatures and dampings of the file.
 
+    MuJoCo's constraint does not know of damping. A fit in steps of first order has the same constraint.
+
     Args:
         spec: The model with its drives; it is changed.
         source: The model's own file.
@@ -177,6 +180,7 @@ def _write_soft_friction(
         fixed.delete(each)
     model = compile_model(fixed, source)
     scales, late = {}, {}
+    second_order = any(drive.second_order for drive in drive_groups(drives).values())
     takes_slopes = spec.option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     for name, weight in weights.items():
         of_joint = spec.joint(name) is not None
@@ -184,7 +188,7 @@ def _write_soft_friction(
         scales[name] = float(np.ravel(own)[0]) / weight
         damping = float(np.ravel(_carrier(spec, name).damping)[0]) if of_joint else 0.0  # a tendon's acts explicitly
         damping += actuators[name].damping if takes_slopes and name in actuators else 0.0
-        late[name] = dt * damping * scales[name] * weight
+        late[name] = dt * damping * scales[name] * weight if second_order else 0.0
     for name, (constant, impedance) in soft_frictions(drives, scales, late).items():
         joint = _carrier(spec, name)
         joint.solref_friction, joint.solimp_friction = [constant, 1.0], [impedance, impedance, 0.001, 0.5, 2.0]
