@@ -118,6 +118,7 @@ class SoftFriction(Effect):
     )
     source = "MuJoCo's manual, friction loss and solver parameters, at its defaults of solimp"
     probes = ({"time_constant": 0.005}, {"time_constant": 0.02}, {"time_constant": 0.08})
+    shared = True
     two_sided = False
     smooths_friction = True
     separates = _SEPARATES

@@ -158,7 +158,7 @@ def test_effects_that_a_joint_or_a_body_holds_move_the_model_as_in_the_identific
 def test_soft_friction_moves_the_model_as_in_the_identification(tmp_path):
     result = without_effects(write_result(tmp_path / "result.json", delay=3.0))
     content = json.loads(result.read_text())
-    values = {"friction": dict.fromkeys(JOINTS, 3.0), "soft_friction.time_constant": dict.fromkeys(JOINTS, 0.02)}
+    values = {"friction": dict.fromkeys(JOINTS, 3.0), "soft_friction.time_constant": {"all": 0.02}}
     changed(result, effects=["soft_friction"], parameters=content["parameters"] | values)
     targets = 0.1 * chirp(len(JOINTS))
     expected, _ = identified_motion(result, targets)
@@ -285,7 +285,7 @@ def test_what_steps_of_second_order_identified_moves_so_in_plain_steps(tmp_path,
         "encoder_bias": of(0.02, -0.03),
     }
     if soft:
-        parameters |= {"friction": of(5.0, 0.5), "soft_friction.time_constant": of(soft, soft)}
+        parameters |= {"friction": of(5.0, 0.5), "soft_friction.time_constant": {"all": soft}}
     result = result_of(tmp_path, path, cfg, parameters, {**stated, "effort_limit": of(150.0, 28.0), **flags})
     changed(result, effects=["soft_friction"] if soft else [])
     targets = 0.4 * chirp(2)
