@@ -282,13 +282,13 @@ class Simulation:
         if self.friction_time is None:
             self.friction_time, self._as_armature = torch.zeros_like(self.qvel), torch.zeros_like(self.qvel)
         self.friction_time[:, columns] = time_constant
-        of_joints = self.friction_time_of_joints
-        assert of_joints is not None
-        self._write_softness("dof_solref", "dof_solimp", slice(None), of_joints)
-        if (turn := self.coordinates) is not None:
+        of_joints = self.friction_time
+        if (turn := self.coordinates) is not None:  # friction of motors that move several joints is their tendons'
             motors = turn.carried["frictionloss"]
+            of_joints = of_joints.index_fill(1, motors.columns, 0.0)
             time = self.friction_time[:, motors.columns]
             self._write_softness("tendon_solref_fri", "tendon_solimp_fri", motors.tendons, time)
+        self._write_softness("dof_solref", "dof_solimp", slice(None), of_joints)
 
     def friction_weights(self, columns: torch.Tensor) -> torch.Tensor:
         """What a torque on a joint accelerates it by in the model's own posture, by which MuJoCo scales its friction.
@@ -305,13 +305,6 @@ class Simulation:
             motors = self.coordinates.carried["frictionloss"]
             weights[:, motors.columns] = self.expand("tendon_invweight0")[:, motors.tendons]
         return weights[:, columns]
-
-    @property
-    def friction_time_of_joints(self) -> torch.Tensor | None:
-        """``friction_time`` of MuJoCo's own joints: friction of motors that move several is their tendons'."""
-        if self.friction_time is None or self.coordinates is None:
-            return self.friction_time
-        return self.friction_time.index_fill(1, self.coordinates.carried["frictionloss"].columns, 0.0)
 
     def _write_softness(self, solref: str, solimp: str, which: torch.Tensor | slice, time: torch.Tensor) -> None:
         """Write the solver parameters of frictions, (num_envs, …) [s]; hard ones have those of the model."""
@@ -427,15 +420,15 @@ class Simulation:
         """
         h, damping = self.cfg.dt, self.expand("dof_damping")
         whole, applied = damping.clone(), self.qfrc_applied.clone()
-        if self._as_armature is not None:
-            armature = self.expand("dof_armature")
-            rotors = armature.clone()
-            armature += torch.mul(whole, 0.5 * h, out=self._as_armature)
+        damping *= 0.5
+        if self.friction_time is None or self._as_armature is None:
             self.qfrc_applied.addcmul_(damping, self.qvel, value=-1)
-            damping.zero_()
         else:
-            damping *= 0.5
-            self.qfrc_applied.addcmul_(damping, self.qvel, value=-1)
+            soft, armature = (self.friction_time > 0).any(dim=1, keepdim=True), self.expand("dof_armature")
+            rotors = armature.clone()
+            armature += torch.mul(damping * soft, h, out=self._as_armature)
+            self.qfrc_applied.addcmul_(torch.where(soft, whole, damping), self.qvel, value=-1)
+            damping *= ~soft
         drift(self.qpos, self.qvel, 0.5 * h)
         with self._in_joints():
             outcomes = self._outcomes if self.turns_friction else None  # bound before the step that computes them
@@ -460,7 +453,7 @@ class Simulation:
         """
         most, weight = self.expand("dof_frictionloss"), self.expand("dof_invweight0")
         force, free, constraints = (outcomes[name] for name in _FRICTION)
-        soft = self.friction_time_of_joints
+        soft = self.friction_time
         hard = most if soft is None else torch.where(soft > 0, 0.0, most)
         impulse = impulses(before, self.qvel, force, hard, weight, self.cfg.dt)
         alone = (free == (most > 0.0).sum(dim=1)) & (constraints == free)
@@ -489,7 +482,7 @@ class Simulation:
         if bool(turns.any()):
             those, inverse = hit[turns], torch.linalg.inv(inertia[turns])
             after, soft = self.qvel[those], None
-            if (time := self.friction_time_of_joints) is not None:
+            if (time := self.friction_time) is not None:
                 rate, softness = step_of_constraint(time[those], self.cfg.dt)
                 soft = rate, torch.where(time[those] > 0, softness * self.expand("dof_invweight0")[those], 0.0)
             new = settled(before[those], after, force[those], most[those], inverse, self.cfg.dt, soft)

@@ -139,8 +139,8 @@ class CompiledRobot:
             tensors |= {name: getattr(course, name) for name in ("motion", "point", "push")}
             tensors["room"] = torch.empty(env.num_envs, 12 * env.sim.model.nbody, dtype=torch.float64)
         tensors["before"][:, 5] = env.sim.gained
-        if (soft := env.sim.friction_time_of_joints) is not None:
-            tensors["soft"] = soft.contiguous()
+        if env.sim.friction_time is not None:
+            tensors["soft"] = env.sim.friction_time
         leaves = [_leaves_of(program, used) for program, used in zip(self._programs, source.leaves, strict=True)]
         arguments: dict[str, int] = {
             **dict.fromkeys(ARGUMENTS, 0),

@@ -158,10 +158,12 @@ static void advance(mjModel* m, mjData* d, long long robot, long long k, int par
   memcpy(applied, d->qfrc_applied, n * sizeof(double));
   memcpy(damping, m->dof_damping, n * sizeof(double));
   memcpy(armature, m->dof_armature, n * sizeof(double));
+  int soft = 0;
+  for (int i = 0; a->soft && i < n; ++i) soft |= a->soft[robot * n + i] > 0.0;
   for (int i = 0; i < n; ++i) {{
-    m->dof_damping[i] = a->soft ? 0.0 : 0.5 * damping[i];
-    m->dof_armature[i] += a->soft ? 0.5 * h * damping[i] : 0.0;
-    d->qfrc_applied[i] -= (a->soft ? damping[i] : m->dof_damping[i]) * d->qvel[i];
+    m->dof_damping[i] = soft ? 0.0 : 0.5 * damping[i];
+    m->dof_armature[i] += soft ? 0.5 * h * damping[i] : 0.0;
+    d->qfrc_applied[i] -= (soft ? damping[i] : m->dof_damping[i]) * d->qvel[i];
   }}
   a->drift(m, d->qpos, d->qvel, 0.5 * h);
   step(m, d, robot, k, part, a);

@@ -37,11 +37,7 @@ def error(folder, effects=(), values=None, physics_dt=0.00125):
     files = sorted(str(path) for path in folder.glob("*.npz"))
     problem = load_problem("Pace-TestBench-v0", data=files, validation=[], physics_dt=physics_dt).with_effects(effects)
     per_joint = {name: {"servo": value} for name, value in BASE.items() if name != "delay"}
-    own = {
-        name if "." in name else f"{effect}.{name}": {"servo": value}
-        for effect in effects
-        for name, value in values.items()
-    }
+    own = {name if "." in name else f"{effect}.{name}": value for effect in effects for name, value in values.items()}
     truth = problem.space.from_dict({**per_joint, "delay": {"all": BASE["delay"]}, **own})
     where = torch.ones_like(problem.dataset.train)
     return float(problem.evaluator().residuals(truth[None], where=where).error.double().square().mean().sqrt())
