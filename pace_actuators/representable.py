@@ -116,7 +116,7 @@ def link_notes(drives: IdentifiedDrives) -> list[str]:
 
 
 def refuse_inertia(motor: PaceDCMotor, world: World) -> None:
-    """Refuse a drive that needs the joint's inertia at every step, or MuJoCo's friction, where there is none.
+    """Refuse a drive that needs the joint's inertia at every step, or MuJoCo's friction, in a simulator without it.
 
     Raises:
         ValueError: If it does.

@@ -179,7 +179,7 @@ class TwinSimulation(Simulation):
         stop: torch.Tensor,
         resisting: torch.Tensor,
     ) -> torch.Tensor:
-        """Speed after a step, (candidates, recordings, n): with soft friction, or where there is none, ``hard``.
+        """Speed after a step, (candidates, recordings, n): with soft friction; elsewhere it is ``hard``.
 
         Args:
             speed: Before it.
