@@ -100,8 +100,13 @@ class Plant:
         self.slide = self.model.jnt_type[ids] == int(mujoco.mjtJoint.mjJNT_SLIDE)
 
 
-def load(path: Path) -> Plant:
-    """Compile a robot from its file, base fixed, without its actuators."""
+def load(path: Path, default_friction: bool = False) -> Plant:
+    """Compile a robot from its file, base fixed, without its actuators.
+
+    Args:
+        path: The file.
+        default_friction: Joint friction as MuJoCo has it by default: soft. Otherwise it holds, and gives way at once.
+    """
     limits: dict[str, float] = {}
     inertias: dict[str, np.ndarray] = {}
     if path.suffix == ".urdf":
@@ -136,8 +141,8 @@ def load(path: Path) -> Plant:
         _set_inertia(model, body, tensor)
     model.opt.timestep, model.opt.integrator = STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
-    # friction that holds and gives way at once
-    model.dof_solref[:], model.dof_solimp[:] = (2 * STEP, 1.0), (0.999, 0.999, 0.001, 0.5, 2.0)
+    constant, impedances = (0.02, (0.9, 0.95)) if default_friction else (2 * STEP, (0.999, 0.999))
+    model.dof_solref[:], model.dof_solimp[:] = (constant, 1.0), (*impedances, 0.001, 0.5, 2.0)
     mujoco.mj_setConst(model, mujoco.MjData(model))
     home = model.qpos0.copy()
     for j in range(model.njnt):

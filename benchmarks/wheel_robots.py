@@ -160,9 +160,9 @@ def model_file(robot: Robot, cache: Path) -> Path:
     return folder / robot.path
 
 
-def make_logs(robot: Robot, hidden: str, cache: Path) -> tuple[Path, Path, Path]:
+def make_logs(robot: Robot, hidden: str, cache: Path, soft: bool = False) -> tuple[Path, Path, Path]:
     """Model file, log and held-out log of a case, made where they are not in the cache."""
-    path, kind = model_file(robot, cache), hidden or "clean"
+    path, kind = model_file(robot, cache), kind_of(hidden, soft)
     folder = cache / "logs" / robot.name
     files = folder / f"{kind}.csv", folder / f"{kind}_held_out.csv"
     if all(file.is_file() for file in files) and (folder / f"{kind}_truth.json").is_file():
@@ -172,13 +172,18 @@ def make_logs(robot: Robot, hidden: str, cache: Path) -> tuple[Path, Path, Path]
     started = time.monotonic()
     drives = draw(load(path), seed, hidden)
     for number, (file, seconds) in enumerate(zip(files, (SECONDS, HELD_OUT_SECONDS), strict=True), start=1):
-        plant = load(path)  # a hidden effect leaves its traces in the model
+        plant = load(path, soft)  # a hidden effect leaves its traces in the model
         target = commands(drives, seconds, seed + number)
         _write_log(file, plant, drives, target, log(plant, drives, target, seed + 10 * number))
     (folder / f"{kind}_truth.json").write_text(json.dumps(drives.truth(), indent=1))
     what = f"{len(drives.joints)} joints, {drives.rate:g} Hz, {time.monotonic() - started:.0f} s"
     print(f"logs of {robot.name}, {kind}: {what}", file=sys.stderr, flush=True)
     return path, *files
+
+
+def kind_of(hidden: str, soft: bool) -> str:
+    """Name of a case's files."""
+    return (hidden or "clean") + ("_soft" if soft else "")
 
 
 def _write_log(file: Path, plant: Plant, drives: Drives, target: np.ndarray, shown: np.ndarray) -> None:
@@ -194,14 +199,16 @@ def _write_log(file: Path, plant: Plant, drives: Drives, target: np.ndarray, sho
 
 def run_case(robot: Robot, hidden: str, args: argparse.Namespace) -> dict:
     """Fit one robot as a user would; returns its line."""
+    kind = kind_of(hidden, args.default_friction)
     row = {"robot": robot.name, "hidden": hidden, "file": robot.path.rsplit("/", 1)[-1], "wheel": robot.wheel}
+    row["wanted"] = [*([HIDDEN[hidden]] if hidden else []), *(["soft_friction"] if args.default_friction else [])]
     try:
-        path, data, held_out = make_logs(robot, hidden, args.cache)
+        path, data, held_out = make_logs(robot, hidden, args.cache, args.default_friction)
     except Exception as error:  # whatever is wrong with a wheel or the plant is no verdict on the fit
         return {**row, "verdict": "no log", "message": f"{type(error).__name__}: {error}"}
-    truth = json.loads((data.parent / f"{hidden or 'clean'}_truth.json").read_text())
+    truth = json.loads((data.parent / f"{kind}_truth.json").read_text())
     row["joints"] = len(truth["armature"])
-    runs = args.cache / "runs" / args.label / robot.name / (hidden or "clean")
+    runs = args.cache / "runs" / args.label / robot.name / kind
     runs.mkdir(parents=True, exist_ok=True)
     command = [
         *(sys.executable, ROOT / "scripts" / "fit.py", "--task", path, "--data", data, "--validation", held_out),
@@ -336,15 +343,15 @@ def compared(result: dict, truth: dict) -> dict:
 
 def verdict(row: dict) -> str:
     """One word on a case that ended with a result."""
-    if row["hidden"]:
+    if row["hidden"] or (row.get("wanted") and "found" in row):
         if "found" not in row:
             return "not diagnosed"
         names = {text.partition("@")[0] for text in row["found"]}
         hidden_on = row["truth_hidden"][1]
         # a payload is a wrong link
         names |= {"payload" if joint in hidden_on else label for label, joint in row.get("links", {}).items()}
-        wanted = HIDDEN[row["hidden"]]
-        return "named" if names == {wanted} else "named with others" if wanted in names else "not named"
+        wanted = set(row.get("wanted", [HIDDEN.get(row["hidden"], "")]))
+        return "named" if names == wanted else "named with others" if wanted <= names else "not named"
     if row["held_out_over_noise"] > AT_NOISE:
         return "wrong valley" if row["held_out_over_noise"] > 3 else "above the noise"
     if row.get("found"):
@@ -404,6 +411,9 @@ def main() -> None:
         "--hidden", action="store_true", help="logs with one hidden effect each, in turn, not clean ones"
     )
     parser.add_argument("--effect", choices=HIDDEN, help="with --hidden: this one for all")
+    parser.add_argument(
+        "--default_friction", action="store_true", help="logs with joint friction as MuJoCo has it by default: soft"
+    )
     parser.add_argument("--diagnose", action="store_true", help="fit --diagnose")
     parser.add_argument("--optimizer", default="least_squares")
     parser.add_argument("--fit_options", nargs="*", default=[], help="more options of fit, without their dashes")
@@ -432,7 +442,7 @@ def main() -> None:
     if args.logs_only:
         for robot, hidden in cases:
             try:
-                make_logs(robot, hidden, args.cache)
+                make_logs(robot, hidden, args.cache, args.default_friction)
             except Exception as error:
                 print(f"no log of {robot.name}: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
         return

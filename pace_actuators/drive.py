@@ -339,6 +339,12 @@ class Drive(Part):
         return stack.state.friction if stack is not None and stack.changes_passive else self.friction
 
     @property
+    def joint_friction_time(self) -> torch.Tensor | None:
+        """Time constant with which that friction gives way [s], 0 where it is hard; ``None`` where no effect says."""
+        stack = self.effects
+        return stack.state.friction_time if stack is not None and stack.has("constraint") else None
+
+    @property
     def joint_viscous_friction(self) -> torch.Tensor:
         """Viscous friction that the simulator is to apply until the next call [N m s/rad], (num_envs, num_joints)."""
         stack = self.effects

@@ -30,6 +30,7 @@ from mjlab.managers.event_manager import EventTermCfg, requires_model_fields
 from mjlab.utils.spec import create_motor_actuator, get_non_free_joints
 
 from pace_actuators.actions import ActuatorActions
+from pace_actuators.effects.fading_friction import solver_parameters, step_of_constraint
 from pace_actuators.identified import IdentifiedDrives
 from pace_actuators.pace_dc_motor import PaceDCMotor
 from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
@@ -148,15 +149,18 @@ class PaceDCMotorActuator(Actuator):  # type: ignore[misc]
         ).encoder_bias
         self._bias = bias.to(device)
         timeconst = 2 * dt if self.cfg.friction_timeconst is None else self.cfg.friction_timeconst
-        impedance = self.cfg.friction_impedance
-        for field, value in (
-            ("dof_solref", [timeconst, 1.0]),
-            ("dof_solimp", [impedance, impedance, 0.001, 0.5, 2.0]),
-        ):
-            getattr(mj_model, field)[self._dofs.cpu().numpy()] = value
+        impedance, soft = self.cfg.friction_impedance, self.motor.joint_friction_time
+        solref = torch.tensor([[timeconst, 1.0]], device=device).repeat(len(self._dofs), 1)
+        solimp = torch.tensor([[impedance, impedance, 0.001, 0.5, 2.0]], device=device).repeat(len(self._dofs), 1)
+        if soft is not None:  # the same in all environments
+            own = (soft[0] > 0).nonzero()[:, 0]
+            constants, impedances = solver_parameters(*step_of_constraint(soft[0, own], dt))
+            solref[own, 0], solimp[own, :2] = constants, impedances[:, None]
+        for field, value in (("dof_solref", solref), ("dof_solimp", solimp)):
+            getattr(mj_model, field)[self._dofs.cpu().numpy()] = value.cpu().numpy()
             array = getattr(model, field)
             for world in range(1 if array.stride(0) == 0 else array.shape[0]):
-                array[world, self._dofs] = torch.tensor(value, device=device)
+                array[world, self._dofs] = value
 
     def compute(self, cmd: ActuatorCmd) -> torch.Tensor:
         """Torques [N m], (num_envs, num_joints); writes friction where an effect changes it."""

@@ -23,6 +23,9 @@ class World:
     bodies: bool = True
     """Whether a drive can change the rigid body that its joint moves."""
 
+    soft_friction: bool = True
+    """Whether its Coulomb friction is MuJoCo's constraint, whose softness a drive can set."""
+
     friction_per_step: bool = True
     """Whether a drive can change the joint's friction at every physics step."""
 
@@ -43,6 +46,7 @@ MJLAB = World(
 ISAACLAB = World(
     name="Isaac Lab",
     bodies=False,
+    soft_friction=False,
     inertia_per_step=False,
     friction_hook="set ArticulationCfg.class_type to a class of DriveFrictionMixin (pace_actuators.isaaclab) and "
     "isaaclab.assets.Articulation; it copies friction to the CPU at every physics step, which is slow",
@@ -57,7 +61,8 @@ def check_representable(drives: IdentifiedDrives, world: World = HERE) -> list[s
         world: Where it is to be used.
 
     Raises:
-        ValueError: If an effect changes friction or reads the inertia at every step, and the world has no way to do so.
+        ValueError: If the world has no way to do what an effect needs: to change friction or read the inertia at every
+            step, or MuJoCo's friction.
     """
     notes = [] if world.bodies else link_notes(drives)
     for cfg in drives.effects:
@@ -69,6 +74,11 @@ def check_representable(drives: IdentifiedDrives, world: World = HERE) -> list[s
             notes.append(
                 f"{kind.name} changes the rigid body that a joint moves. In {world.name} a drive cannot do this. Use "
                 "the model that pace export --format mjcf --joints_only writes: it has the change."
+            )
+        if kind.overrides("constraint") and not world.soft_friction:
+            raise ValueError(
+                f"{kind.name} is MuJoCo's own friction constraint, which {world.name} does not have. Fit again without "
+                "it, or train elsewhere."
             )
         if kind.reads_link and not world.inertia_per_step:
             raise ValueError(
@@ -106,11 +116,16 @@ def link_notes(drives: IdentifiedDrives) -> list[str]:
 
 
 def refuse_inertia(motor: PaceDCMotor, world: World) -> None:
-    """Refuse a drive that needs the joint's inertia at every step, where the simulator does not give it.
+    """Refuse a drive that needs the joint's inertia at every step, or MuJoCo's friction, in a simulator without it.
 
     Raises:
         ValueError: If it does.
     """
+    if motor.joint_friction_time is not None and not world.soft_friction:
+        raise ValueError(
+            f"Soft friction is MuJoCo's own constraint, which {world.name} does not have. Leave it out of the drive's "
+            "effects."
+        )
     if motor.needs_link and not world.inertia_per_step and motor.effects is not None:
         names = ", ".join(effect.name for effect in motor.effects.effects if effect.reads_link)
         raise ValueError(

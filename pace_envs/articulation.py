@@ -308,7 +308,10 @@ class Articulation(RobotState):
     def _write_passive(self, actuator: PaceDCMotor) -> None:
         """Write what the simulator carries of a drive: rotor inertia, friction, the link's rigid body."""
         actuator.update_effects()
-        self._write_what_drags(actuator, self._place_of(actuator))
+        place = self._place_of(actuator)
+        self._write_what_drags(actuator, place)
+        if (time := actuator.joint_friction_time) is not None:
+            self._sim.soften_friction(place, time)
         self._sim.constants_changed()
 
     def _build_actuators(self) -> None:

@@ -15,10 +15,16 @@ Joints that stick creep a little in MuJoCo's step. Where none turns, one pass ov
 model's posture (``dof_invweight0``), ends that; a GPU takes this pass alone.
 
 A free step has no more constraints than frictions. Where a contact, a limit or an equality acts, nothing is changed.
+
+Soft friction (``soft_friction``) is MuJoCo's own constraint, which the step has solved: a + b' v + R' f = 0 within ± F.
+It changes only where hard friction of another joint turns, and settles with that:
+
+    f += clip(f - (a + b' v + R' f) / (w + R'), ± F) - f
 """
 
 from __future__ import annotations
 
+import mujoco
 import torch
 
 NOTABLE = 1e-6
@@ -41,7 +47,16 @@ static double off(double before, double speed, double force, double w, double h,
   const double stop = h * w * most, step = turned(before, speed - before - h * w * force, stop) - speed;
   return fabs(step) > {NOTABLE} * stop ? step : 0.0;
 }}
-static void settle(const mjModel* m, mjData* d, const double* before, double* change, Solve solve) {{
+static double yielding(const mjModel* m, int i, double before, double speed, double force, double w) {{
+  const double impedance = m->dof_solimp[{mujoco.mjNIMP} * i], h = m->opt.timestep, most = m->dof_frictionloss[i];
+  const double rate = 2.0 / (impedance * m->dof_solref[{mujoco.mjNREF} * i]);
+  const double soft = (1.0 - impedance) / impedance * m->dof_invweight0[i];
+  const double wanted = force - ((speed - before) / h + rate * before + soft * force) / (w + soft);
+  const double step = h * w * (fmin(fmax(wanted, -most), most) - force);
+  return fabs(step) > {NOTABLE} * h * w * most ? step : 0.0;
+}}
+static void settle(
+    const mjModel* m, mjData* d, const double* before, double* change, const double* soft, Solve solve) {{
   const int n = m->nv;
   const double h = m->opt.timestep, *most = m->dof_frictionloss;
   double* inverse = (double*)calloc(2 * (n + 1) * n, sizeof(double));
@@ -54,7 +69,9 @@ static void settle(const mjModel* m, mjData* d, const double* before, double* ch
     turns = 0;
     for (int i = 0; i < n; ++i) {{
       const double *row = inverse + i * n, w = row[i];
-      const double step = most[i] > 0.0 ? off(before[i], speed[i], force[i], w, h, most[i]) : 0.0;
+      const double step = most[i] <= 0.0 ? 0.0
+          : soft && soft[i] > 0.0 ? yielding(m, i, before[i], speed[i], force[i], w)
+          : off(before[i], speed[i], force[i], w, h, most[i]);
       if (step == 0.0) continue;
       turns = 1;
       force[i] += step / (h * w);
@@ -64,7 +81,8 @@ static void settle(const mjModel* m, mjData* d, const double* before, double* ch
   for (int i = 0; i < n; ++i) change[i] = speed[i] - d->qvel[i];
   free(inverse);
 }}
-static void turn_friction(const mjModel* m, mjData* d, const double* before, double* room, Solve solve, Drift drift) {{
+static void turn_friction(const mjModel* m, mjData* d, const double* before, double* room, const double* soft,
+                          Solve solve, Drift drift) {{
   const int n = m->nv;
   const double h = m->opt.timestep, *most = m->dof_frictionloss;
   double *impulse = room, *change = room + n;
@@ -73,21 +91,23 @@ static void turn_friction(const mjModel* m, mjData* d, const double* before, dou
     const double w = m->dof_invweight0[i];
     rows += most[i] > 0.0;
     const double force = d->qfrc_constraint[i], f = most[i];
-    const double step = f > 0.0 && w > 0.0 ? off(before[i], d->qvel[i], force, w, h, f) : 0.0;
+    const int is_hard = f > 0.0 && w > 0.0 && !(soft && soft[i] > 0.0);
+    const double step = is_hard ? off(before[i], d->qvel[i], force, w, h, f) : 0.0;
     impulse[i] = step == 0.0 ? 0.0 : step / w;
     creeps |= step != 0.0;
     turns |= fabs(step) > {TURNS} * h * w * most[i];
   }}
   if (!creeps || d->nf != rows || d->nefc != rows) return;
   if (turns)
-    settle(m, d, before, change, solve);
+    settle(m, d, before, change, soft, solve);
   else
     solve(m, d, change, impulse, 1);
   for (int i = 0; i < n; ++i) d->qvel[i] += change[i];
   drift(m, d->qpos, change, h);
 }}
 """
-"""The same in C, after MuJoCo's step: ``before`` are the speeds before it, ``room`` has 2 nv numbers."""
+"""The same in C, after MuJoCo's step: ``before`` are the speeds before it, ``room`` has 2 nv numbers, ``soft`` are the
+time constants of soft frictions, 0 where they are hard, or none."""
 
 
 def turned(speed: torch.Tensor, pushed: torch.Tensor, stop: torch.Tensor) -> torch.Tensor:
@@ -111,6 +131,7 @@ def impulses(
     most: torch.Tensor,
     weight: torch.Tensor,
     step: float,
+    soft: tuple[torch.Tensor, torch.Tensor] | None = None,
 ) -> torch.Tensor:
     """By what the friction of each joint alone differs over a step, (num_envs, nv) [N m s]; zero where it does not.
 
@@ -121,9 +142,15 @@ def impulses(
         most: Coulomb friction F.
         weight: Each joint's w.
         step: h [s].
+        soft: b' and R' of soft friction, where R' is above 0; ``None``: all is hard.
     """
     stop = step * weight * most
     change = turned(before, after - before - step * weight * force, stop) - after
+    if soft is not None:
+        rate, softness = soft
+        left = (after - before) / step + rate * before + softness * force
+        wanted = torch.clamp(force - left / (weight + softness), -most, most)
+        change = torch.where(softness > 0, step * weight * (wanted - force), change)
     return torch.where((change.abs() > NOTABLE * stop) & (most > 0.0), change / weight, 0.0)
 
 
@@ -134,6 +161,7 @@ def settled(
     most: torch.Tensor,
     inverse: torch.Tensor,
     step: float,
+    soft: tuple[torch.Tensor, torch.Tensor] | None = None,
 ) -> torch.Tensor:
     """Speeds after a step in which the frictions of all joints have turned, (num_envs, nv).
 
@@ -144,6 +172,7 @@ def settled(
         most: As for it.
         inverse: M⁻¹, (num_envs, nv, nv).
         step: h [s].
+        soft: As for it, (num_envs, nv) each.
     """
     speed, force, turns = after.clone(), force.clone(), True
     for _ in range(SWEEPS):
@@ -151,7 +180,8 @@ def settled(
             break
         turns = False
         for i in range(speed.shape[1]):
-            impulse = impulses(before[:, i], speed[:, i], force[:, i], most[:, i], inverse[:, i, i], step)
+            own = None if soft is None else (soft[0][:, i], soft[1][:, i])
+            impulse = impulses(before[:, i], speed[:, i], force[:, i], most[:, i], inverse[:, i, i], step, own)
             if bool(impulse.any()):
                 turns = True
                 force[:, i] += impulse / step

@@ -16,6 +16,7 @@ import torch
 from mujoco import batch
 
 from pace_actuators.effects import Effect
+from pace_actuators.effects.fading_friction import solver_parameters, step_of_constraint
 from pace_actuators.memory import check_memory
 from pace_envs.coulomb import TURNS, impulses, settled
 from pace_envs.model_file import leave_out_pictures
@@ -121,6 +122,8 @@ class Simulation:
         dtype: Type of all tensors.
         model: The compiled model.
         gained: Of speed in the last step of second order, in MuJoCo's coordinates, (num_envs, nv).
+        friction_time: Time constant of each Coulomb friction that gives way, 0 where it is hard, (num_envs, nv) [s];
+            ``None``: all are hard.
         version: Grows where arrays were replaced: CUDA graphs that were captured before are of no use.
     """
 
@@ -175,6 +178,9 @@ class Simulation:
         self._link_places: dict[int, tuple[torch.Tensor, ...]] = {}
         self._frame: _Frame | None = None
         self.coordinates: MotorCoordinates | None = None
+        self.friction_time: torch.Tensor | None = None
+        self._as_armature: torch.Tensor | None = None
+        """Of damping, in the inertia that was computed last, (num_envs, nv) [kg m²]; only where friction is soft."""
 
     def couple(self, coordinates: MotorCoordinates) -> None:
         """Let state, torques and what drives leave to the model be those of motors in the columns of their joints."""
@@ -265,6 +271,48 @@ class Simulation:
         self.expand("dof_frictionloss")[:, columns] = friction
         self.expand("dof_damping")[:, columns] = damping
 
+    def soften_friction(self, columns: torch.Tensor | slice, time_constant: torch.Tensor) -> None:
+        """Let Coulomb friction give way, as MuJoCo's own constraint does.
+
+        Args:
+            columns: Degrees of freedom.
+            time_constant: Of MuJoCo's ``solreffriction`` at its defaults of ``solimp``, 0 where it is hard,
+                (num_envs, len(columns)) [s].
+        """
+        if self.friction_time is None:
+            self.friction_time, self._as_armature = torch.zeros_like(self.qvel), torch.zeros_like(self.qvel)
+        self.friction_time[:, columns] = time_constant
+        of_joints = self.friction_time
+        if (turn := self.coordinates) is not None:  # friction of motors that move several joints is their tendons'
+            motors = turn.carried["frictionloss"]
+            of_joints = of_joints.index_fill(1, motors.columns, 0.0)
+            time = self.friction_time[:, motors.columns]
+            self._write_softness("tendon_solref_fri", "tendon_solimp_fri", motors.tendons, time)
+        self._write_softness("dof_solref", "dof_solimp", slice(None), of_joints)
+
+    def friction_weights(self, columns: torch.Tensor) -> torch.Tensor:
+        """What a torque on a joint accelerates it by in the model's own posture, by which MuJoCo scales its friction.
+
+        Args:
+            columns: Degrees of freedom.
+
+        Returns:
+            (num_envs, len(columns)) [1 / kg m²].
+        """
+        self.update_constants()
+        weights = self.expand("dof_invweight0").clone()
+        if self.coordinates is not None:
+            motors = self.coordinates.carried["frictionloss"]
+            weights[:, motors.columns] = self.expand("tendon_invweight0")[:, motors.tendons]
+        return weights[:, columns]
+
+    def _write_softness(self, solref: str, solimp: str, which: torch.Tensor | slice, time: torch.Tensor) -> None:
+        """Write the solver parameters of frictions, (num_envs, …) [s]; hard ones have those of the model."""
+        constant, impedance = solver_parameters(*step_of_constraint(time, self.cfg.dt))
+        for field, value, width in ((solref, constant, 1), (solimp, impedance, 2)):
+            hard = self.tensor(getattr(self.model, field))[which, :width]
+            self.expand(field)[:, which, :width] = torch.where((time > 0)[..., None], value[..., None], hard)
+
     def felt_link(self, columns: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """What joints carry, as it was computed last, (num_envs, len(columns)) each; gravity pulls no slide back.
 
@@ -285,6 +333,8 @@ class Simulation:
         else:
             diagonal = fields["M"] @ self._motor_inertias[:, columns]
         inertia = (diagonal - self.expand("dof_armature")[:, columns]).clamp(min=0.0)
+        if self._as_armature is not None:
+            inertia = (inertia - self._as_armature[:, columns]).clamp(min=0.0)
         axis, arm = fields["xaxis"][:, joints], fields["subtree_com"][:, bodies] - fields["xanchor"][:, joints]
         weight = self.expand("body_subtreemass")[:, bodies, None] * gravity
         turned = torch.linalg.cross(torch.linalg.cross(axis, arm), weight)
@@ -365,12 +415,20 @@ class Simulation:
     def _leap(self, drift: Drift) -> None:
         """A step of second order around MuJoCo's, which moves the positions of its middle with the new speed.
 
-        Half of the damping acts on the speed before the step, half on the speed after it.
+        Half of the damping acts on the speed before the step, half on the speed after it. Soft friction follows the
+        acceleration, and MuJoCo's constraints do not know of damping: there the second half stands as armature.
         """
         h, damping = self.cfg.dt, self.expand("dof_damping")
         whole, applied = damping.clone(), self.qfrc_applied.clone()
         damping *= 0.5
-        self.qfrc_applied.addcmul_(damping, self.qvel, value=-1)
+        if self.friction_time is None or self._as_armature is None:
+            self.qfrc_applied.addcmul_(damping, self.qvel, value=-1)
+        else:
+            soft, armature = (self.friction_time > 0).any(dim=1, keepdim=True), self.expand("dof_armature")
+            rotors = armature.clone()
+            armature += torch.mul(damping * soft, h, out=self._as_armature)
+            self.qfrc_applied.addcmul_(torch.where(soft, whole, damping), self.qvel, value=-1)
+            damping *= ~soft
         drift(self.qpos, self.qvel, 0.5 * h)
         with self._in_joints():
             outcomes = self._outcomes if self.turns_friction else None  # bound before the step that computes them
@@ -381,6 +439,8 @@ class Simulation:
             torch.sub(self.qvel, before, out=self.gained)
         drift(self.qpos, self.qvel, -0.5 * h)
         damping.copy_(whole)
+        if self._as_armature is not None:
+            armature.copy_(rotors)
         self.qfrc_applied.copy_(applied)
 
     def _turn_friction(self, before: torch.Tensor, outcomes: Mapping[str, torch.Tensor], drift: Drift) -> None:
@@ -393,7 +453,9 @@ class Simulation:
         """
         most, weight = self.expand("dof_frictionloss"), self.expand("dof_invweight0")
         force, free, constraints = (outcomes[name] for name in _FRICTION)
-        impulse = impulses(before, self.qvel, force, most, weight, self.cfg.dt)
+        soft = self.friction_time
+        hard = most if soft is None else torch.where(soft > 0, 0.0, most)
+        impulse = impulses(before, self.qvel, force, hard, weight, self.cfg.dt)
         alone = (free == (most > 0.0).sum(dim=1)) & (constraints == free)
         change = self._change_of_speeds(torch.where(alone[:, None], impulse, 0.0), before, force, most)
         self.qvel += change
@@ -419,8 +481,12 @@ class Simulation:
         turns = (impulse.abs() > TURNS * self.cfg.dt * most[hit]).any(dim=1)
         if bool(turns.any()):
             those, inverse = hit[turns], torch.linalg.inv(inertia[turns])
-            after = self.qvel[those]
-            change[those] = settled(before[those], after, force[those], most[those], inverse, self.cfg.dt) - after
+            after, soft = self.qvel[those], None
+            if (time := self.friction_time) is not None:
+                rate, softness = step_of_constraint(time[those], self.cfg.dt)
+                soft = rate, torch.where(time[those] > 0, softness * self.expand("dof_invweight0")[those], 0.0)
+            new = settled(before[those], after, force[those], most[those], inverse, self.cfg.dt, soft)
+            change[those] = new - after
         return change
 
     @cached_property
@@ -445,6 +511,8 @@ class Simulation:
     def forward(self, env_ids: EnvIds = None) -> None:
         """Compute everything that follows from the state, without advancing time."""
         self.update_constants()
+        if self._as_armature is not None:
+            self._as_armature[self.rows(env_ids)] = 0.0
         with self._in_joints():
             self.batch.forward(None if env_ids is None else self.resolve_env_ids(env_ids))
         if self._bias is not None and self._frame is None:

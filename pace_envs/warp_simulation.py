@@ -152,6 +152,8 @@ class WarpSimulation(Simulation):
         """
         self.update_constants()
         if env_ids is None or not self._bound <= _AFTER_RESETS.union(_STATE):
+            if self._as_armature is not None:
+                self._as_armature.zero_()
             self._run("forward")
 
     def reset(self, env_ids: EnvIds = None) -> None:

@@ -90,7 +90,7 @@ Others are similar in part, especially in narrow recordings:
 | `presliding_friction`, `creeping_friction` and `soft_friction` | a staircase that holds each step longer |
 
 Give a joint only one of the last three: each replaces the simulator's Coulomb friction. `soft_friction` is not the
-physics of a drive but of MuJoCo's solver. Use it for recordings from MuJoCo.
+physics of a drive but of MuJoCo's solver, alike on all joints. Use it for recordings from MuJoCo.
 
 No effect finds commands that jitter or are lost, or coarse quantisation. Where a log stamps its commands by a separate
 clock (`des_time`), the fit holds each command from its own stamp, and reports jitter and losses. Elsewhere they raise

@@ -27,6 +27,7 @@ class DriveState(Part):
         viscous_friction: What the simulator is to apply [N m s/rad].
         implicit_damping: More of it, which must act on the speed at the end of the step [N m s/rad].
         armature: Rotor inertia that the simulator carries [kg m²].
+        friction_time: Time constant with which the simulator's Coulomb friction gives way [s]; 0: it is hard.
 
     What effects read:
         position_error: Of the controller, q* less what it takes for the position [rad].
@@ -58,6 +59,7 @@ class DriveState(Part):
     viscous_friction: torch.Tensor
     implicit_damping: torch.Tensor
     armature: torch.Tensor
+    friction_time: torch.Tensor
     position_error: torch.Tensor
     joint_pos: torch.Tensor
     joint_vel: torch.Tensor

@@ -144,6 +144,7 @@ class Effect(Part):
         dt: Time between two calls of the drive (the physics step) [s].
         control_dt: Time between two runs of the controller [s], the control step unless the drive has its own.
         is_trapezoidal: Whether the simulator moves positions with the mean of the old and the new speed.
+        meets_soft_friction: Whether an effect of its drive makes Coulomb friction soft (``s.friction_time``).
         new_rows: Which rows have no history yet, (rows, 1) bool; on the CPU ``None`` if all have.
         buffers: Its delays, by name; a reset of rows resets them too.
     """
@@ -160,6 +161,8 @@ class Effect(Part):
     """Its equation, as text."""
     looks: ClassVar[str] = ""
     """What a person would see in the data."""
+    remark: ClassVar[str] = ""
+    """What a diagnosis that finds it says beside its name."""
     source: ClassVar[str] = ""
     """Where the equation comes from."""
     memory: ClassVar[Collection[str]] = ()
@@ -234,7 +237,7 @@ class Effect(Part):
         self.rows = rows
         self.shape = (len(range(*rows.indices(num_envs))), num_joints)
         self.dt, self.control_dt, self.delay_mode = dt, control_dt, delay_mode
-        self.is_trapezoidal = False
+        self.is_trapezoidal, self.meets_soft_friction = False, False
         self._options: dict[str, Any] = {"device": torch.device(device), "dtype": dtype}
         self._on_device = torch.device(device).type == "cuda"
         self.new_rows: torch.Tensor | None = ~self._no_rows()
@@ -316,6 +319,9 @@ class Effect(Part):
 
     def armature(self, s: DriveState) -> None:
         """After each change of parameters: change ``s.armature``, the rotor inertia that the simulator carries."""
+
+    def constraint(self, s: DriveState) -> None:
+        """After each change of parameters: change ``s.friction_time``, how soft the simulator's Coulomb friction is."""
 
     def write_model(self, model: Any, joint: int) -> None:
         """After each change of parameters: change the rigid body that a joint moves (see ``LinkModel``)."""

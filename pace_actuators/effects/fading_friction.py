@@ -2,41 +2,53 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import torch
 
 from pace_actuators.effects.drive_state import DriveState
 from pace_actuators.effects.effect import Effect, EffectParameter
 from pace_actuators.effects.registry import register_effect
 
+IMPEDANCE, WIDEST = 0.9, 0.95
+"""MuJoCo's defaults of ``solimp``: d, the impedance at rest, and the largest, which it takes for b."""
+_SEPARATES = "a staircase that holds each of its steps longer, and a slow triangle"
 
-class _FadingFriction(Effect):
-    """What friction laws share that take the level over from the simulator, at the speed in the middle of the step."""
 
-    stage = "friction"
-    two_sided = False
-    smooths_friction = True
-    memory = ("_before",)
-    _before: torch.Tensor
-    separates = "a staircase that holds each of its steps longer, and a slow triangle"
+def step_of_constraint(time_constant: torch.Tensor, dt: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """MuJoCo's friction constraint, whose rate b acts on a speed within a step h, as one of the speed before it.
 
-    def middle_speed(self, s: DriveState) -> torch.Tensor:
-        """The speed in the middle of the step, as the last two let expect [rad/s]; once per step."""
-        self.begin(_before=s.motor_vel)
-        middle = 1.5 * s.motor_vel - 0.5 * self._before
-        self._before = s.motor_vel.clone()
-        return middle
+    Below its level friction f holds a joint with the acceleration a and the speed v to a + b v + R f = 0. With R = ρ A,
+    A what a torque on the joint alone accelerates it by, ρ = (1 - d) / d and b = 2 / (0.95 T), a step has
 
-    def drag(self, s: DriveState, damping: torch.Tensor) -> None:
-        """Add a drag [N m s/rad]; the part that is too fast for the step acts on the speed at its end."""
-        resolved = torch.minimum(damping, s.armature / self.dt)
-        s.viscous_friction += resolved
-        s.implicit_damping += damping - resolved
+        a + b (v + θ h a) + R f = 0    or    a + b' v + R' f = 0,    b' = b / (1 + θ b h),  R' = R / (1 + θ b h)
+
+    with θ = ½, of second order, or where that would let the speed ring, d b h > 2, with 1 - 1 / (d b h).
+
+    Args:
+        time_constant: T [s].
+        dt: h [s].
+
+    Returns:
+        b' [1/s] and ρ' = R' / A.
+    """
+    time = WIDEST * time_constant
+    share = (1 - time / (2 * IMPEDANCE * dt)).clamp(min=0.5)
+    longer = time + 2 * dt * share
+    return 2 / longer, (1 - IMPEDANCE) / IMPEDANCE * time / longer
+
+
+def solver_parameters(rate: torch.Tensor, softness: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """What MuJoCo is to be given for b' and ρ': the time constant of ``solreffriction`` [s], and the impedance.
+
+    Args:
+        rate: b' [1/s].
+        softness: ρ'.
+    """
+    impedance = 1 / (1 + softness)
+    return 2 / (impedance * rate), impedance
 
 
 @register_effect
-class CreepingFriction(_FadingFriction):
+class CreepingFriction(Effect):
     """Coulomb friction that fades towards standstill, so that a loaded joint creeps instead of sticking.
 
     F tanh(|v|/v_s) is its tangent at the speed in the middle of the step, L + D |v|. The simulator applies the level L,
@@ -45,6 +57,11 @@ class CreepingFriction(_FadingFriction):
     """
 
     name = "creeping_friction"
+    stage = "friction"
+    two_sided = False
+    smooths_friction = True
+    memory = ("_before",)
+    _before: torch.Tensor
     parameters = (
         EffectParameter(name="velocity", unit="rad/s", lower=0.0, upper=0.5, null=0.0, start=0.02, meaning="v_s"),
     )
@@ -52,6 +69,7 @@ class CreepingFriction(_FadingFriction):
     looks = "a joint that should stick creeps on under its load; soft reversals"
     source = "regularised Coulomb friction (e.g. Marques, Flores, Claro, Lankarani 2016); simulators' soft friction"
     probes = ({"velocity": 0.005}, {"velocity": 0.02}, {"velocity": 0.08}, {"velocity": 0.25})
+    separates = _SEPARATES
     velocity: torch.Tensor
 
     def prepare(self) -> None:
@@ -62,23 +80,31 @@ class CreepingFriction(_FadingFriction):
 
     def transmission(self, s: DriveState) -> None:
         """Split the level, after all that changes it."""
-        relative = self.middle_speed(s).abs() / self._velocity
+        self.begin(_before=s.motor_vel)
+        middle = 1.5 * s.motor_vel - 0.5 * self._before  # of the step, as the last two speeds let expect
+        self._before = s.motor_vel.clone()
+        relative = middle.abs() / self._velocity
         share = torch.tanh(relative)
         slope = 1 - share.square()
         level = (share - slope * relative).clamp(min=0.0)
-        self.drag(s, torch.where(self._on, slope * s.friction / self._velocity, 0.0))
+        damping = torch.where(self._on, slope * s.friction / self._velocity, 0.0)
+        resolved = torch.minimum(damping, s.armature / self.dt)
+        s.viscous_friction += resolved
+        s.implicit_damping += damping - resolved
         s.friction = torch.where(self._on, level * s.friction, s.friction)
 
 
 @register_effect
-class SoftFriction(_FadingFriction):
+class SoftFriction(Effect):
     """Coulomb friction as MuJoCo's constraint ``frictionloss`` has it: it gives way within a time constant.
 
     The constraint asks for the acceleration -b v with an impedance d. Below its level it brakes with d (τ + M b v),
-    τ all other torques and M the joint's inertia: a joint that should stick creeps, and a turn takes longer.
+    τ all other torques and M the joint's inertia: a joint that should stick creeps, and a turn takes longer. The
+    simulator applies it: MuJoCo by its own constraint, which solves it for all joints together.
     """
 
     name = "soft_friction"
+    stage = "friction"
     parameters = (
         EffectParameter(
             name="time_constant", unit="s", lower=0.0, upper=0.2, null=0.0, start=0.02, meaning="T, solref's first"
@@ -86,30 +112,18 @@ class SoftFriction(_FadingFriction):
     )
     equation = "f = -clip(d (τ + M b v), ± F), b = 2 / (0.95 T), d = 0.9"
     looks = "a joint that should stick creeps on under its load; soft reversals"
+    remark = (
+        "soft_friction is MuJoCo's default for frictionloss: the log may come from a simulator. "
+        "Joints of real robots stick."
+    )
     source = "MuJoCo's manual, friction loss and solver parameters, at its defaults of solimp"
     probes = ({"time_constant": 0.005}, {"time_constant": 0.02}, {"time_constant": 0.08})
-    reads_load = True
-    reads_link = True
-    impedance: ClassVar[float] = 0.9
-    """At rest, d."""
-    widest: ClassVar[float] = 0.95
-    """Largest impedance, which MuJoCo takes for b."""
+    shared = True
+    two_sided = False
+    smooths_friction = True
+    separates = _SEPARATES
     time_constant: torch.Tensor
 
-    def prepare(self) -> None:
-        """Where it acts, and how fast it takes a speed away."""
-        super().prepare()
-        self._on = self.time_constant > 0
-        self._rate = torch.where(self._on, 2 / (self.widest * self.time_constant), 0.0)
-
-    def transmission(self, s: DriveState) -> None:
-        """Brake below the level in place of the simulator, after all that changes the level."""
-        speed = self.middle_speed(s)
-        free = s.effort + s.load_effort - s.viscous_friction * speed
-        damping = self.impedance * self._rate * (s.link_inertia + s.base_armature)
-        asked = self.impedance * free + damping * speed
-        below = self._on & (asked.abs() < s.friction)
-        against = self._on & ~below & (asked * speed < 0)  # it slows a turn down
-        s.effort -= torch.where(below, self.impedance * free, torch.where(against, torch.sign(asked) * s.friction, 0.0))
-        self.drag(s, torch.where(below, damping, 0.0))
-        s.friction = torch.where(below | against, 0.0, s.friction)
+    def constraint(self, s: DriveState) -> None:
+        """Let the simulator apply it."""
+        s.friction_time = self.time_constant

@@ -31,6 +31,7 @@ _STAGES = (
     "friction",
     "transmission",
     "armature",
+    "constraint",
 )
 
 
@@ -101,6 +102,8 @@ class EffectStack(Part):
             ]
             for stage in _STAGES
         }
+        for effect in self.effects:
+            effect.meets_soft_friction = bool(self._at["constraint"])
         self.acts_in_drive = any(self._at[stage] for stage in _IN_DRIVE)
         """Whether what is asked of the motor becomes another torque between its two limits."""
         self.changes_passive = bool(self._at["friction"] or self._at["transmission"])
@@ -159,6 +162,8 @@ class EffectStack(Part):
         join_couplings(self.effects, self._num_envs)
         s.armature, s.friction, s.viscous_friction = armature, friction, viscous_friction
         self.run("armature")
+        s.friction_time.zero_()
+        self.run("constraint")
 
     def begin_step(self, joint_pos: torch.Tensor, joint_vel: torch.Tensor) -> None:
         """Bring the effects' own states to the present instant, once per physics step."""

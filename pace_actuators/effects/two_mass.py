@@ -32,6 +32,7 @@ import torch
 
 from pace_actuators.effects.drive_state import DriveState
 from pace_actuators.effects.effect import Effect, EffectParameter, off
+from pace_actuators.effects.fading_friction import step_of_constraint
 from pace_actuators.effects.registry import register_effect
 
 _SMALLEST_ARMATURE = 1e-6
@@ -41,6 +42,9 @@ _RESOLVED = 0.1
 """Furthest that motor and link move against each other in a step [rad, m]. A link without inertia rings on from step to
 step in this scheme, and a gap or a torque that no drive could hold makes it ring louder: beyond this, k h (θ̇₊ - v₊) is
 added, which ends it."""
+
+_HARDEST = 1e-4
+"""Least R' / A of soft friction, as MuJoCo has it."""
 
 _SIDE = EffectParameter(
     name="encoder_side",
@@ -128,7 +132,8 @@ class _TwoMass(Effect):
         total = self._inertia + self._coupling
         speed = (self._drive + self._coupling * s.joint_vel) / total
         # friction brakes, it does not push; 0 in direction: the motor stuck
-        speed = speed * (speed * self._direction > 0)
+        braked = speed * (speed * self._direction > 0)
+        speed = torch.where(s.friction_time > 0, speed, braked) if self.meets_soft_friction else braked
         moving = 0.5 * (self._speed + speed) if self.is_trapezoidal else speed
         self._angle = self._angle + self.dt * moving
         self._speed = speed
@@ -182,10 +187,18 @@ class _TwoMass(Effect):
         drag = 0.5 * s.viscous_friction
         inertia = momentum + drag + s.implicit_damping
         push = (momentum - drag) * self._speed + s.effort - explicit
-        free = push + coupling * s.joint_vel
-        stuck = free.abs() <= s.friction
+        free, level = push + coupling * s.joint_vel, s.friction
+        stuck = free.abs() <= level
         direction = torch.sign(free) * ~stuck
-        push = push - s.friction * direction
+        if self.meets_soft_friction:
+            soft = s.friction_time > 0
+            grip, pull = self._held_softly(s, momentum)
+            asked = grip * (free + pull) / (inertia + grip + coupling) - pull
+            holds = soft & (asked.abs() < level)
+            inertia, push = inertia + torch.where(holds, grip, 0.0), push + torch.where(holds, pull, 0.0)
+            level, stuck = torch.where(holds, 0.0, level), stuck & ~soft
+            direction = torch.where(soft, torch.sign(asked), direction)
+        push = push - level * direction
         total = inertia + coupling
         share = coupling / total * ~stuck
         self._drive, self._coupling, self._inertia, self._direction = push, coupling, inertia, direction
@@ -197,6 +210,17 @@ class _TwoMass(Effect):
         else:
             s.viscous_friction = torch.where(self._on, 0.0, s.viscous_friction)
             s.friction = torch.where(self._on, 0.0, s.friction)
+
+    def _held_softly(self, s: DriveState, momentum: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Of the motor's soft friction below its level, -grip θ̇₊ + pull: its law (θ̇₊ - θ̇)/h + b' θ̇ + R' f = 0.
+
+        Args:
+            s: The drive's state.
+            momentum: Motor's inertia by the step [N m s/rad].
+        """
+        rate, softness = step_of_constraint(s.friction_time, self.dt)
+        grip = momentum / softness.clamp(min=_HARDEST)
+        return grip, grip * (1 - self.dt * rate) * self._speed
 
     def _where_on(self, value: torch.Tensor, otherwise: torch.Tensor) -> torch.Tensor:
         return value if self._all else torch.where(self._on, value, otherwise)

@@ -132,13 +132,15 @@ class CompiledRobot:
             "series": self._series,
             "memory": torch.empty(env.num_envs, max(1, source.memory), dtype=torch.float64),
             "bias": env.sim.qfrc_bias.clone() if reads_load else torch.zeros_like(env.sim.qvel),
-            "before": torch.zeros(env.num_envs, 6, env.sim.model.nv, dtype=torch.float64),
+            "before": torch.zeros(env.num_envs, 7, env.sim.model.nv, dtype=torch.float64),
             "out": torch.empty(len(at), env.num_envs, env.scene["robot"].num_joints, dtype=torch.float64),
         }
         if (course := self._course) is not None:
             tensors |= {name: getattr(course, name) for name in ("motion", "point", "push")}
             tensors["room"] = torch.empty(env.num_envs, 12 * env.sim.model.nbody, dtype=torch.float64)
         tensors["before"][:, 5] = env.sim.gained
+        if env.sim.friction_time is not None:
+            tensors["soft"] = env.sim.friction_time
         leaves = [_leaves_of(program, used) for program, used in zip(self._programs, source.leaves, strict=True)]
         arguments: dict[str, int] = {
             **dict.fromkeys(ARGUMENTS, 0),

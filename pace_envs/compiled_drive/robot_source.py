@@ -28,6 +28,7 @@ ARGUMENTS = {
     "tendon_bias": "void (*tendon_bias)(const mjModel*, mjData*, mjtNum*)",
     "drift": "Drift drift",  # mj_integratePos where steps are those of Simulation._leap, else 0
     "solve": "Solve solve",  # mj_solveM where friction turns, else 0
+    "soft": "const double* soft",  # time constants of soft frictions (environments, nv), or 0
     # sizes
     "robots": "long long robots",  # environments
     "recordings": "long long recordings",
@@ -40,7 +41,7 @@ ARGUMENTS = {
     "series": "const double* series",  # (names, steps, recordings, joints)
     "memory": "double* memory",  # of the drives of each environment
     "bias": "double* bias",  # forces of gravity and motion (environments, nv)
-    "before": "double* before",  # room for a step (environments, 6, nv); its last row: what speeds gained
+    "before": "double* before",  # room for a step (environments, 7, nv); row 5: what speeds gained
     "out": "double* out",  # what is shown (rows, environments, joints)
     "effort": "double* effort",  # the motors' torques there, where they are recorded
     "state": "double* state",  # MuJoCo's positions and speeds there (rows, environments, nq + nv), or 0
@@ -124,7 +125,7 @@ static long long row(long long robot, long long k, long long parts, long long pa
 static void step(mjModel* m, mjData* d, long long robot, long long k, int part, const Arguments* a) {{
   {there}
   const int n = m->nv, leaps = a->drift != 0;
-  double *before = a->before + (6 * robot + 2) * n, *gained = before + 3 * n;
+  double *before = a->before + (7 * robot + 2) * n, *gained = before + 3 * n;
   memcpy(before, d->qvel, n * sizeof(double));
   a->step1(m, d);
   if (leaps) {{
@@ -142,7 +143,7 @@ static void step(mjModel* m, mjData* d, long long robot, long long k, int part, 
   }}
   memcpy(d->qvel, before, n * sizeof(double));
   a->step2(m, d);
-  if (a->solve) turn_friction(m, d, before, before + n, a->solve, a->drift);
+  if (a->solve) turn_friction(m, d, before, before + n, a->soft ? a->soft + robot * n : 0, a->solve, a->drift);
   for (int i = 0; i < n; ++i) gained[i] = d->qvel[i] - before[i];
   {back}
 }}
@@ -153,17 +154,22 @@ static void advance(mjModel* m, mjData* d, long long robot, long long k, int par
   }}
   const int n = m->nv;
   const double h = m->opt.timestep;
-  double *applied = a->before + 6 * robot * n, *damping = applied + n;
+  double *applied = a->before + 7 * robot * n, *damping = applied + n, *armature = applied + 6 * n;
   memcpy(applied, d->qfrc_applied, n * sizeof(double));
   memcpy(damping, m->dof_damping, n * sizeof(double));
+  memcpy(armature, m->dof_armature, n * sizeof(double));
+  int soft = 0;
+  for (int i = 0; a->soft && i < n; ++i) soft |= a->soft[robot * n + i] > 0.0;
   for (int i = 0; i < n; ++i) {{
-    m->dof_damping[i] = 0.5 * damping[i];
-    d->qfrc_applied[i] -= m->dof_damping[i] * d->qvel[i];
+    m->dof_damping[i] = soft ? 0.0 : 0.5 * damping[i];
+    m->dof_armature[i] += soft ? 0.5 * h * damping[i] : 0.0;
+    d->qfrc_applied[i] -= (soft ? damping[i] : m->dof_damping[i]) * d->qvel[i];
   }}
   a->drift(m, d->qpos, d->qvel, 0.5 * h);
   step(m, d, robot, k, part, a);
   a->drift(m, d->qpos, d->qvel, -0.5 * h);
   memcpy(m->dof_damping, damping, n * sizeof(double));
+  memcpy(m->dof_armature, armature, n * sizeof(double));
   memcpy(d->qfrc_applied, applied, n * sizeof(double));
 }}
 {functions}

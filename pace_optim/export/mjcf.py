@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +16,13 @@ from pace_actuators.base_parameters import BASE_PARAMETERS
 from pace_actuators.drive_result import ALL
 from pace_actuators.effects import Effect
 from pace_actuators.effects.command import GravityCompensation
-from pace_actuators.effects.fading_friction import SoftFriction
 from pace_actuators.text import listed
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.identified import load_identified_cfg, use_identified
 from pace_envs.model_file import compile_model, missing_files, read_model_file
 from pace_envs.motor_coordinates import DrivenJoints, add_motors
 from pace_envs.robot_spec import load_robot_spec
+from pace_optim.export.configs import drive_groups
 from pace_optim.export.mjcf_drives import write_drives
 from pace_optim.export.plain_drive import (
     GAIN_EFFECTS,
@@ -31,6 +31,7 @@ from pace_optim.export.plain_drive import (
     effect_notes,
     is_undetermined,
     plain_drives,
+    soft_frictions,
 )
 
 _BODY_FIELDS = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat")
@@ -67,16 +68,14 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
                 _set(joint, parameter.mujoco, drives.values(parameter.name, [name])[name])
         joint.actfrcrange = [0.0, 0.0]  # none: the drive has its limit
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-    for name, time_constant in _soft_frictions(drives, robot.joint_names).items():
-        joint = _carrier(spec, name)
-        joint.solref_friction = [time_constant, 1.0]
-        joint.solimp_friction = [SoftFriction.impedance, SoftFriction.widest, 0.001, 0.5, 2.0]
     if spec.meshes:
         spec.meshdir = str((source.parent / spec.meshdir).resolve())
     changed = _write_bodies(spec, plain, env)
+    weights = dict(zip(robot.joint_names, env.sim.friction_weights(robot.dof_columns)[0].tolist(), strict=True))
     env.close()
     plain.close()
     held = [e.effect_class.name for e in drives.effects if _in_the_model(e.effect_class)]
+    actuators: dict[str, PlainDrive] = {}
     if joints_only:
         notes = _notes_of_joints(drives)
     else:
@@ -85,6 +84,7 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
         notes += more
         notes += write_drives(spec, actuators, drives.at.physics_dt, couplings)
         held += [*GAIN_EFFECTS, *JOINT_EFFECTS, *_compensated(spec, drives, notes)]
+    _write_soft_friction(spec, source, drives, weights, actuators)
     if changed:
         notes.append(f"changed rigid bodies, which are in the model: {', '.join(changed)}.")
     notes += [*effect_notes(drives, held), *left_out]
@@ -153,6 +153,47 @@ def _in_plain_steps(
     return result, notes
 
 
+def _write_soft_friction(
+    spec: mujoco.MjSpec,
+    source: Path,
+    drives: IdentifiedDrives,
+    weights: Mapping[str, float],
+    actuators: Mapping[str, PlainDrive],
+) -> None:
+    """Write the solver parameters of soft frictions, which follow the armatures and dampings of the file.
+
+    MuJoCo's constraint does not know of damping. A fit in steps of first order has the same constraint.
+
+    Args:
+        spec: The model with its drives; it is changed.
+        source: The model's own file.
+        drives: What was identified.
+        weights: What a torque on each joint accelerates it by there [1 / kg m²].
+        actuators: The drives in the file.
+    """
+    if not soft_frictions(drives):
+        return
+    fixed, dt = spec.copy(), drives.at.physics_dt
+    for joint in [each for each in fixed.joints if each.type == mujoco.mjtJoint.mjJNT_FREE]:
+        fixed.delete(joint)  # the base is held in the fit
+    for each in [*fixed.keys, *fixed.sensors]:
+        fixed.delete(each)
+    model = compile_model(fixed, source)
+    scales, late = {}, {}
+    second_order = any(drive.second_order for drive in drive_groups(drives).values())
+    takes_slopes = spec.option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    for name, weight in weights.items():
+        of_joint = spec.joint(name) is not None
+        own = model.dof_invweight0[model.joint(name).dofadr[0]] if of_joint else model.tendon(name).invweight0
+        scales[name] = float(np.ravel(own)[0]) / weight
+        damping = float(np.ravel(_carrier(spec, name).damping)[0]) if of_joint else 0.0  # a tendon's acts explicitly
+        damping += actuators[name].damping if takes_slopes and name in actuators else 0.0
+        late[name] = dt * damping * scales[name] * weight if second_order else 0.0
+    for name, (constant, impedance) in soft_frictions(drives, scales, late).items():
+        joint = _carrier(spec, name)
+        joint.solref_friction, joint.solimp_friction = [constant, 1.0], [impedance, impedance, 0.001, 0.5, 2.0]
+
+
 def _carrier(spec: mujoco.MjSpec, name: str) -> Any:
     """What carries a drive's armature, damping and friction: its joint, or the tendon of a motor of several."""
     return spec.joint(name) or spec.tendon(name)
@@ -188,14 +229,7 @@ def _exclude_overlaps(spec: mujoco.MjSpec, source: Path) -> list[str]:
 
 
 def _in_the_model(kind: type[Effect]) -> bool:
-    return kind is SoftFriction or kind.overrides("write_model")
-
-
-def _soft_frictions(drives: IdentifiedDrives, joint_names: Sequence[str]) -> dict[str, float]:
-    """Time constants [s] of the joints whose friction is that of MuJoCo's own constraint."""
-    own = [cfg.joints(joint_names) for cfg in drives.effects if cfg.effect_class is SoftFriction]
-    values = drives.values("soft_friction.time_constant", own[0]) if own else {}
-    return {name: value for name, value in values.items() if value > 0}
+    return kind.overrides("constraint") or kind.overrides("write_model")
 
 
 def _set(joint: Any, attribute: str, value: float) -> None:

@@ -18,10 +18,11 @@ from pace_optim.export.plain_drive import (
     effect_notes,
     is_undetermined,
     plain_drives,
+    soft_frictions,
     whole_steps_note,
 )
 
-HELD = (*GAIN_EFFECTS, "parallel_spring", "quadratic_friction")
+HELD = (*GAIN_EFFECTS, "parallel_spring", "quadratic_friction", "soft_friction")
 """Effects that the page holds."""
 _START = "# --- the page starts here\n"
 
@@ -44,6 +45,7 @@ def mjlab_native_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
             for joint, drive in plain.items()
             if drive.spring or drive.quadratic
         },
+        "_SOFT_": {joint: tuple(map(digits, pair)) for joint, pair in soft_frictions(drives).items()},
         "_BIAS_": {joint: digits(-drive.encoder_bias) for joint, drive in plain.items() if drive.encoder_bias},
     }
     classes = ", ".join(sorted({call.name for call in calls}))
@@ -69,6 +71,9 @@ ARTICULATION = EntityArticulationInfoCfg(actuators=ACTUATORS)
 
 ENCODER_BIAS = _BIAS_
 """mjlab's encoder shows q + these [rad, of slides m]."""
+
+SOFT_FRICTION = _SOFT_
+"""Joints whose Coulomb friction is soft: time constant [s] and impedance of MuJoCo's constraint."""
 
 BESIDE = _BESIDE_
 """Torques beside the drives: spring k [N m/rad] and rest q₀ [rad], quadratic b₂: - k (q - q₀) - b₂ v |v|."""

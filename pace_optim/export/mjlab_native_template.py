@@ -12,6 +12,7 @@ from typing import Any
 PHYSICS_DT: float = 0.0
 ACTUATORS: tuple[Any, ...] = ()
 ENCODER_BIAS: dict[str, float] = {}
+SOFT_FRICTION: dict[str, tuple[float, float]] = {}
 BESIDE: dict[str, dict[str, float]] = {}
 EventTermCfg: Any = dict
 SceneEntityCfg: Any = dict
@@ -31,7 +32,7 @@ EVENTS = {
 
 
 def write_joints(spec):
-    """Give the joints what no actuator of mjlab has: springs, and Coulomb friction that is not soft.
+    """Give the joints what no actuator of mjlab has: springs, and Coulomb friction as hard as it was found.
 
     The friction's solver parameters are those of the identification.
 
@@ -41,8 +42,9 @@ def write_joints(spec):
     import math
 
     for joint in spec.joints:
-        joint.solref_friction = [2 * PHYSICS_DT, 1.0]
-        joint.solimp_friction = [0.999, 0.999, 0.001, 0.5, 2.0]
+        constant, impedance = SOFT_FRICTION.get(joint.name, (2 * PHYSICS_DT, 0.999))
+        joint.solref_friction = [constant, 1.0]
+        joint.solimp_friction = [impedance, impedance, 0.001, 0.5, 2.0]
         beside = BESIDE.get(joint.name)
         if beside:
             unit = math.degrees(1.0) if spec.compiler.degree and joint.type.name == "mjJNT_HINGE" else 1.0

@@ -6,9 +6,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import torch
+
 from pace_actuators import IdentifiedDrives
 from pace_actuators.drive_result import ALL
 from pace_actuators.effects import Effect
+from pace_actuators.effects.fading_friction import SoftFriction, solver_parameters, step_of_constraint
 from pace_actuators.joint_values import resolve_joint_values
 from pace_actuators.representable import of_the_recording
 from pace_optim.export.configs import drive_groups
@@ -158,6 +161,28 @@ def plain_drives(drives: IdentifiedDrives) -> tuple[dict[str, PlainDrive], list[
             "actuator delays commands, which is another physics."
         )
     return {joint: result[joint] for joint in drives.joint_names if joint in result}, notes
+
+
+def soft_frictions(
+    drives: IdentifiedDrives, weights: Mapping[str, float] | None = None, late: Mapping[str, float] | None = None
+) -> dict[str, tuple[float, float]]:
+    """Time constant [s] and impedance of MuJoCo's friction constraint, of joints whose friction is soft.
+
+    They are for the identification's step: MuJoCo's constraint takes a speed half a step older than the fit's.
+
+    Args:
+        drives: What was identified.
+        weights: By what MuJoCo scales the friction of each joint, as a multiple of the identification's.
+        late: What damping adds to the inertia of each joint in a step, as a part of it: the constraint knows of none.
+    """
+    result = {}
+    for joint, time in _of_effect(drives, SoftFriction.name).items():
+        if time > 0:
+            rate, softness = step_of_constraint(torch.tensor(time, dtype=torch.float64), drives.at.physics_dt)
+            more = 1 + (late or {}).get(joint, 0.0)
+            own = solver_parameters(more * rate, more * softness / (weights or {}).get(joint, 1.0))
+            result[joint] = float(own[0]), float(own[1])
+    return result
 
 
 def effect_notes(drives: IdentifiedDrives, held: Sequence[str]) -> list[str]:

@@ -37,7 +37,7 @@ def error(folder, effects=(), values=None, physics_dt=0.00125):
     files = sorted(str(path) for path in folder.glob("*.npz"))
     problem = load_problem("Pace-TestBench-v0", data=files, validation=[], physics_dt=physics_dt).with_effects(effects)
     per_joint = {name: {"servo": value} for name, value in BASE.items() if name != "delay"}
-    own = {f"{effect}.{name}": {"servo": value} for effect in effects for name, value in values.items()}
+    own = {name if "." in name else f"{effect}.{name}": value for effect in effects for name, value in values.items()}
     truth = problem.space.from_dict({**per_joint, "delay": {"all": BASE["delay"]}, **own})
     where = torch.ones_like(problem.dataset.train)
     return float(problem.evaluator().residuals(truth[None], where=where).error.double().square().mean().sqrt())
@@ -79,3 +79,14 @@ def test_soft_friction_moves_as_mujocos_own(friction_time_constant, tmp_path, mo
     with_it, without = error(folder, ["soft_friction"], values, physics_dt=0.000625), error(folder)
     assert without > 1e-3
     assert with_it < 0.15 * without
+
+
+def test_soft_friction_of_a_motor_behind_an_elastic_shaft_moves_as_mujocos_own(tmp_path, monkeypatch):
+    sizes, values = HIDDEN["joint_elasticity"]
+    folder, fine = written(tmp_path, monkeypatch, sizes, 0.02), 0.0003125
+    elastic = {f"joint_elasticity.{name}": value for name, value in values.items()}
+    hard = error(folder, ["joint_elasticity"], elastic, physics_dt=fine)
+    both = {**elastic, "soft_friction.time_constant": 0.02}
+    soft = error(folder, ["joint_elasticity", "soft_friction"], both, physics_dt=fine)
+    assert hard > 1e-3
+    assert soft < 0.1 * hard

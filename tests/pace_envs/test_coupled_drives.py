@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from pace_actuators import PaceDCMotorCfg
+from pace_actuators.effects.fading_friction import solver_parameters, step_of_constraint
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.from_model import cfg_from_model
 from pace_envs.motor_coordinates import DrivenJoints
@@ -62,21 +63,28 @@ def shown_by(problem, physical):
     return moved(problem, physical).positions(torch.arange(len(problem.dataset.measured)))[:, 0]
 
 
+@pytest.mark.parametrize("soft", [0.0, 0.03], ids=["hard", "soft"])
 @pytest.mark.parametrize("case", coupled_drives.CASES, ids=lambda case: case.name)
-def test_motors_move_as_tendons_of_plain_mujoco(case, tmp_path):
+def test_motors_move_as_tendons_of_plain_mujoco(case, soft, tmp_path):
     """Step by step, with MuJoCo's own steps: armature, damping, friction and torque of the motors."""
     path = tmp_path / "robot.xml"
     path.write_text(case.xml())
     cfg = cfg_from_model(path, 1e-3)
     cfg.sim.integrator, cfg.scene.num_envs = "implicitfast", 2
+    cfg.set_effects(["soft_friction"] if soft else [])
     env = ManagerBasedRLEnv(cfg)
     robot, rows = env.scene["robot"], rows_of(case)
+    if soft:
+        robot.write_effect_parameter_to_sim("soft_friction", "time_constant", torch.full((2, 1), soft).double())
     for name in ("armature", "viscous_friction", "friction"):
         robot.write_base_parameter_to_sim(name, torch.tensor([case.truth[name]] * 2).double())
     model = mujoco.MjModel.from_xml_string(case.xml())
     model.tendon_armature[:], model.tendon_damping[:] = case.truth["armature"], case.truth["viscous_friction"]
     model.tendon_frictionloss[:], model.tendon_solref_fri[:] = case.truth["friction"], (2e-3, 1.0)
     model.tendon_solimp_fri[:] = (0.999, 0.999, 0.001, 0.5, 2.0)
+    if soft:
+        constant, impedance = solver_parameters(*step_of_constraint(torch.tensor(soft).double(), 1e-3))
+        model.tendon_solref_fri[:, 0], model.tendon_solimp_fri[:, :2] = float(constant), float(impedance)
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION | mujoco.mjtDisableBit.mjDSBL_CONTACT
     data = mujoco.MjData(model)

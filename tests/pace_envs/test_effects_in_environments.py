@@ -317,6 +317,10 @@ PAIRS = [
         ("creeping_friction", "stribeck_friction", "joint_elasticity"),
         {"creeping_friction.velocity": 0.02, "stribeck_friction.effort": 1.0, "joint_elasticity.stiffness": 300.0},
     ),
+    (
+        ("joint_elasticity", "soft_friction"),
+        {"joint_elasticity.stiffness": 300.0, "soft_friction.time_constant": 0.05},
+    ),
     (("soft_friction", "stribeck_friction"), {"soft_friction.time_constant": 0.02, "stribeck_friction.effort": 1.0}),
     (("integral_gain", "proportional_gain"), {"integral_gain.gain": 100.0, "proportional_gain.gain": 0.2}),
     (

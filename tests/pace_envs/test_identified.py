@@ -17,6 +17,7 @@ from torque_sequence import DT, GAINS, JOINTS, write_result
 from pace_actuators import IdentifiedDrives, PaceDCMotor, PaceDCMotorCfg
 from pace_actuators.drive_result import DriveResult
 from pace_actuators.effects import get_effect
+from pace_actuators.effects.fading_friction import solver_parameters, step_of_constraint
 from pace_actuators.identified_draws import draw, labels_with_std
 from pace_actuators.representable import HERE, ISAACLAB, MJLAB, World, check_representable, refuse_inertia
 from pace_envs import ManagerBasedRLEnv, TerrainCfg, load_env_cfg, set_physics_dt
@@ -186,6 +187,21 @@ def test_what_cannot_be_represented_is_said(result):
         assert len(said) == 3 and "--format mjcf" in said[1] and hook in said[2]
     with pytest.raises(ValueError, match=r"stribeck_friction.*cannot do"):
         check_representable(drives, World(name="a world", friction_per_step=False))
+
+
+def test_soft_friction_is_in_training_and_wherever_mujoco_is(result):
+    changed(result, effects=["soft_friction"], parameters={"soft_friction.time_constant": {"all": 0.02}})
+    env, drives = walking(result), IdentifiedDrives.load(result)
+    columns, step = env.scene["robot"].dof_columns, env.cfg.sim.dt
+    constant, impedance = solver_parameters(*step_of_constraint(torch.tensor(0.02, dtype=torch.float64), step))
+    assert torch.allclose(env.sim.expand("dof_solref")[:, columns, 0], constant)
+    assert torch.allclose(env.sim.expand("dof_solimp")[:, columns, :2], impedance)
+    env.close()
+    assert check_representable(drives, HERE) == check_representable(drives, MJLAB) == []
+    with pytest.raises(ValueError, match=r"soft_friction is MuJoCo's own.*Isaac Lab does not have"):
+        check_representable(drives, ISAACLAB)
+    with pytest.raises(ValueError, match="Soft friction is MuJoCo's own"):
+        refuse_inertia(motor(PaceDCMotorCfg(**drives.cfg_fields()), DT), ISAACLAB)
 
 
 def test_a_payload_weighs_in_training(result):

@@ -8,7 +8,7 @@ from functools import cache
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.checks.data_check import DataCheck
 from pace_optim.diagnosis.search.state import Outcome
-from pace_optim.diagnosis.verdict.names import curves_in
+from pace_optim.diagnosis.verdict.names import curves_in, new_effects
 from pace_optim.diagnosis.verdict.verdict import confounded
 from pace_optim.joints.fits.fitted import Fitted
 from pace_optim.joints.fits.labels import found_effects
@@ -22,7 +22,10 @@ def advise(
     problem: Problem, outcome: Outcome, decision: str, data: DataCheck, absorbed: Iterable[type[Effect]]
 ) -> list[str]:
     """Sentences, the most useful first."""
-    result = next_experiments(problem, rivals(problem.joint_names, outcome), data.noise, outcome.cfg.menu)
+    model = outcome.final.model
+    found = [e for e, has in zip(model.effects, new_effects(outcome, model), strict=True) if bool(has.any())]
+    result = [effect.remark for effect in found if effect.remark]
+    result += next_experiments(problem, rivals(problem.joint_names, outcome), data.noise, outcome.cfg.menu)
     if data.loads == 1:
         result.append(
             "All recordings carry the same load: friction that grows with the load, and a wrong torque or mass, cannot "
@@ -40,7 +43,7 @@ def advise(
         f"separate them, you need {effect.separates}."
         for effect in absorbed
     ]
-    if decision == "unknown" or bool(curves_in(outcome.final.model).any()):
+    if decision == "unknown" or bool(curves_in(model).any()):
         whose = "the error" if decision == "unknown" else "the error of some joints"
         result.append(
             f"None of the known effects explains {whose}. The report shows which variable carries it. Find "

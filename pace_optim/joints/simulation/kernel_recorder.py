@@ -50,7 +50,8 @@ def _simulation(joint: OneJoint, true: TwinSimulation) -> Any:
     own, alone = vars(sim), true._stands_alone[columns].double().expand(1, len(joint.rows), -1)
     own |= {"num_envs": 1, "_as_in_model": True, "_shape": (1, 1), "_columns": torch.tensor([0])}
     own |= {"_felt": None, "_steps": 0, "path": _Path(joint, list(true._model_values))}
-    for key in ("qpos", "qvel", "qfrc_applied", "_implicit"):
+    softness = () if true.friction_time is None else ("friction_time", "_rate", "_softness", "_rest_inertia")
+    for key in ("qpos", "qvel", "qfrc_applied", "_implicit", *softness):
         joint.replace(own, vars(true), key, columns=columns)
     for key, values, places in (
         ("_expanded", true._expanded, columns),

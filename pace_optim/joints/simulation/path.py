@@ -126,6 +126,8 @@ class ReferencePath:
     """The joints; motors that move several of the model's are among them."""
     control_dt: float
     """[s]."""
+    rest_inertia: torch.Tensor
+    """Inertia without armature that each joint shows in the model's own posture, all others free, (R, n) [kg m²]."""
     phases: FreePhases | None = None
     """What is not known of the free phases of each joint; ``None`` where all bases rest."""
 
@@ -166,13 +168,18 @@ class ReferencePath:
         chosen = list(joints)
         phases = None if self.phases is None else self.phases.on_joints(chosen)
         return self._part(
-            (..., chosen), columns=self.columns[chosen], names=tuple(self.names[j] for j in chosen), phases=phases
+            (..., chosen),
+            rest_inertia=self.rest_inertia[:, chosen],
+            columns=self.columns[chosen],
+            names=tuple(self.names[j] for j in chosen),
+            phases=phases,
         )
 
     def select(self, recordings: Sequence[int]) -> ReferencePath:
         """Some of the recordings, by index."""
         phases = None if self.phases is None else self.phases.select(recordings)
-        return self._part((slice(None), list(recordings)), phases=phases)
+        rest = self.rest_inertia[list(recordings)]
+        return self._part((slice(None), list(recordings)), rest_inertia=rest, phases=phases)
 
     def at(self, step: torch.Tensor, recording: torch.Tensor) -> ReferencePath:
         """Parts of the recordings: of each (W,) those control steps (T', W); without any, the last one."""
@@ -183,6 +190,7 @@ class ReferencePath:
         intervals = step[:-1]
         return replace(
             self,
+            rest_inertia=self.rest_inertia[recording],
             position=of(self.position, step),
             feel=self.feel.map(lambda each: of(each, intervals)),
             stiffness=of(self.stiffness, intervals),
@@ -329,13 +337,16 @@ def _along(
     for key, has in now.items():  # each twin has its own part of an effect itself; its neighbours' stays
         change = load_changes[key] = LoadChange(**vars(felt[key]), stiffness=stiffer[key])
         feel, stiffness = feel.less(change, has), stiffness - has * change.stiffness
+    columns, sim = rollout.robot.dof_columns, rollout.env.sim
+    rest_inertia = 1 / sim.friction_weights(columns) - sim.expand("dof_armature")[:, columns]
     rollout.env.close()
     return ReferencePath(
         position=positions[..., rollout.robot.qpos_columns],
         feel=feel,
         stiffness=stiffness,
         model_effects=load_changes,
-        columns=rollout.robot.dof_columns,
+        columns=columns,
+        rest_inertia=rest_inertia,
         names=tuple(rollout.robot.joint_names),
         control_dt=problem.control_dt,
         phases=phases,

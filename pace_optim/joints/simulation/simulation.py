@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from pace_actuators.effects import Effect
+from pace_actuators.effects.fading_friction import step_of_constraint
 from pace_envs.coulomb import turned
 from pace_envs.simulation import EnvIds, Simulation, SimulationCfg
 from pace_optim.joints.simulation.path import ReferencePath
@@ -21,7 +22,8 @@ class TwinSimulation(Simulation):
         (M + J + h d/2 + h D) (v₊ - v) = h (τ + f + K (q + h v/2 - q_ref) - d v - D v - F sgn v)
         q₊ = q + h (v + v₊)/2
 
-    with J armature, d viscous and F Coulomb friction, D what must act on v₊.
+    with J armature, d viscous and F Coulomb friction, D what must act on v₊. Soft friction f replaces F sgn v.
+    It follows MuJoCo's constraint, (v₊ - v)/h + b' v + R' f = 0 within ± F, with R' of the whole robot.
     """
 
     is_trapezoidal = True
@@ -40,6 +42,7 @@ class TwinSimulation(Simulation):
         super().__init__(cfg, spec, num_envs)
         self._implicit = torch.zeros_like(self.qvel)
         self._is_implicit = False
+        self._rate, self._softness, self._rest_inertia = (torch.zeros_like(self.qvel) for _ in range(3))
         self._steps = 0
         self._as_in_model = torch.equal(self._columns, torch.arange(self.model.nv))
         self._shape = (-1, path.position.shape[1], len(self._columns))
@@ -135,6 +138,15 @@ class TwinSimulation(Simulation):
             self._is_implicit = True
             self._implicit[:, columns] = implicit
 
+    def soften_friction(self, columns: torch.Tensor | slice, time_constant: torch.Tensor) -> None:
+        """Let Coulomb friction give way, as :meth:`Simulation.soften_friction`."""
+        if self.friction_time is None:
+            self.friction_time = torch.zeros_like(self.qvel)
+            rest = self.path.rest_inertia
+            self._rest_inertia[:, self._columns] = rest.repeat(self.num_envs // len(rest), 1)
+        self.friction_time[:, columns] = time_constant
+        self._rate[:, columns], self._softness[:, columns] = step_of_constraint(time_constant, self.cfg.dt)
+
     def step(self) -> None:
         """Advance by ``dt``."""
         self._constants_changed = False
@@ -153,9 +165,35 @@ class TwinSimulation(Simulation):
         pushed = torch.div(push, resisting).mul_(h)
         stop = torch.div(self._joints(self.expand("dof_frictionloss")), resisting).mul_(h)
         new = turned(v, pushed, stop)
+        if self.friction_time is not None:
+            new = self._yielding(v, new, pushed, stop, resisting)
         self._set(self.qpos, torch.add(q, v, alpha=0.5 * h).add_(new, alpha=0.5 * h))
         self._set(self.qvel, new)
         self._steps += 1
+
+    def _yielding(
+        self,
+        speed: torch.Tensor,
+        hard: torch.Tensor,
+        pushed: torch.Tensor,
+        stop: torch.Tensor,
+        resisting: torch.Tensor,
+    ) -> torch.Tensor:
+        """Speed after a step, (candidates, recordings, n): with soft friction; elsewhere it is ``hard``.
+
+        Args:
+            speed: Before it.
+            hard: After it with hard friction.
+            pushed: What all but friction adds to it.
+            stop: What friction can take from it.
+            resisting: Inertia that all meets.
+        """
+        assert self.friction_time is not None
+        rate, softness, time = (self._joints(each) for each in (self._rate, self._softness, self.friction_time))
+        armature = self._joints(self.expand("dof_armature"))
+        yields = softness * resisting / (self._joints(self._rest_inertia) + armature)
+        asked = (pushed + self.cfg.dt * rate * speed) / (1 + yields)
+        return torch.where(time > 0, speed + pushed - torch.clamp(asked, -stop, stop), hard)
 
     def felt_link(self, columns: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """What joints carry, as :meth:`Simulation.felt_link`."""

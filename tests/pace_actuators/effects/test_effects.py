@@ -18,6 +18,7 @@ from pace_actuators.effects import (
     probe_points,
     register_effect,
 )
+from pace_actuators.effects.fading_friction import IMPEDANCE, WIDEST, step_of_constraint
 
 DT = 0.0025
 
@@ -196,22 +197,22 @@ def test_friction_that_creeps_is_its_tangent_at_the_speed_in_the_middle_of_the_s
         assert float(both.motor.joint_friction) == pytest.approx(0.5 + 1.5 * math.exp(-0.25))
 
 
-@pytest.mark.parametrize(
-    ("target", "v", "effort", "level", "slope"),
-    [
-        (0.002, 0.0, 0.2 - 0.9 * (0.2 - 0.05), 0.0, 1.0),  # below: a tenth of what pushes is left
-        (1.0, 0.3, 100.0 - 0.3, 0.5, 0.0),  # beyond, in the way of the motion: left to the simulator
-        (-1.0, 0.3, -100.3 + 0.5, 0.0, 0.0),  # beyond, and against a turn
-    ],
-)
-def test_soft_friction_is_that_of_mujocos_constraint(target, v, effort, level, slope):
+def test_soft_friction_is_left_to_the_simulator():
     drive = Drive(["soft_friction"], {"soft_friction.time_constant": 0.02})
-    inertia = torch.full((1, 1), 0.3, dtype=torch.float64)
-    drive.motor.set_link(inertia, inertia, inertia)
-    drive.motor.set_load_effort(torch.full((1, 1), -0.05, dtype=torch.float64))
-    assert drive.one(target, v=v) == pytest.approx(effort)
-    assert float(drive.motor.joint_friction) == level
-    assert drag(drive) == pytest.approx(slope * 0.9 * 2 / (0.95 * 0.02) * (0.3 + 0.1))
+    assert drive.one(0.002) == pytest.approx(0.2) and float(drive.motor.joint_friction) == 0.5
+    assert float(drive.motor.joint_friction_time) == 0.02
+    assert Drive(["stribeck_friction"], {}).motor.joint_friction_time is None
+
+
+@pytest.mark.parametrize("time_constant", [1e-6, 1e-3, 0.02, 0.2])
+def test_a_step_of_the_soft_constraint_is_of_second_order_and_does_not_ring(time_constant):
+    """Alone below its level a joint has v' = -d b v."""
+    rate, softness = step_of_constraint(torch.tensor(time_constant, dtype=torch.float64), DT)
+    left = 1 - DT * float(rate / (1 + softness))  # of the speed, after a step
+    b = 2 / (WIDEST * time_constant)
+    assert left >= -1e-12
+    x = IMPEDANCE * b * DT
+    assert left == pytest.approx((1 - x / 2) / (1 + x / 2) if x < 2 else 0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("mode", ["command", "effort"])

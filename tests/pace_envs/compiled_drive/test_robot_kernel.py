@@ -9,7 +9,7 @@ from effect_envs import EFFECTS, Branching
 from problems import ANYMAL, CALM, DT, TRUTH, chirp, env_cfg, legs_chirp, make_problem, physical, record
 
 from pace_actuators import PaceDCMotor
-from pace_actuators.effects import get_effect, registry
+from pace_actuators.effects import EffectCfg, get_effect, registry
 from pace_actuators.files import OwnFolder
 from pace_envs import set_physics_dt
 from pace_envs.compiler import host
@@ -114,6 +114,17 @@ def test_frictions_of_joints_that_push_each_other_settle_as_in_the_environment()
     cfg = env_cfg(ANYMAL)
     problem = make_problem(record(legs_chirp(cfg, 0.3), TRUTH, cfg=cfg), cfg=cfg).with_physics_dt(DT / 2)
     assert apart(problem, problem.space.from_dict({**TRUTH, "friction": 3.0})) < 1e-9
+
+
+@pytest.mark.parametrize("where", [".*", ".*KFE"], ids=["all", "beside hard ones"])
+def test_soft_friction_is_the_environment_s(where):
+    cfg = env_cfg(ANYMAL)
+    problem = make_problem(record(legs_chirp(cfg, 0.3), TRUTH, cfg=cfg), cfg=cfg).with_physics_dt(DT / 2)
+    soft = problem.with_effects([EffectCfg(effect="soft_friction", joint_names_expr=where)])
+    values = soft.space.from_dict({**TRUTH, "friction": 3.0, "soft_friction.time_constant": 0.02})
+    assert apart(soft, values) < 1e-9
+    hard = problem.evaluator().residuals(problem.space.from_dict({**TRUTH, "friction": 3.0})[None]).error
+    assert float((hard - soft.evaluator().residuals(values[None]).error).abs().max()) > 1e-4
 
 
 def test_drives_in_several_groups_whose_joints_are_not_in_the_model_s_order():

@@ -107,8 +107,13 @@ def test_the_mjcf_holds_a_soft_friction(result):
     model = mujoco.MjModel.from_xml_string(exported.text)
     for name, constant in constants.items():
         column = model.joint(name).dofadr[0]
-        assert model.dof_solref[column, 0] == pytest.approx(constant or 2 * DT)
-        assert (model.dof_solimp[column, 0] == pytest.approx(0.9)) == (constant > 0)
+        time, impedance = model.dof_solref[column, 0], model.dof_solimp[column, 0]
+        if not constant:
+            assert (time, impedance) == (pytest.approx(2 * DT), 0.999)
+            continue
+        rate = 2 / (0.95 * constant)  # which acts on the speed in the middle of a step: half a step after MuJoCo's
+        assert 2 / (impedance * time) == pytest.approx(rate / (1 + rate * DT / 2), rel=1e-5)
+        assert (1 - impedance) / impedance == pytest.approx(1 / 9 / (1 + rate * DT / 2), rel=1e-4)
     assert "soft_friction: in the file" in " ".join(exported.notes)
 
 

@@ -155,6 +155,18 @@ def test_effects_that_a_joint_or_a_body_holds_move_the_model_as_in_the_identific
         assert "stiffness" not in joint and "quadratic_friction (τ - b2 v |v|): omitted" in " ".join(newton.notes)
 
 
+def test_soft_friction_moves_the_model_as_in_the_identification(tmp_path):
+    result = without_effects(write_result(tmp_path / "result.json", delay=3.0))
+    content = json.loads(result.read_text())
+    values = {"friction": dict.fromkeys(JOINTS, 3.0), "soft_friction.time_constant": {"all": 0.02}}
+    changed(result, effects=["soft_friction"], parameters=content["parameters"] | values)
+    targets = 0.1 * chirp(len(JOINTS))
+    expected, _ = identified_motion(result, targets)
+    found = replay(fixed_in_the_air(export(result, "mjcf").text), JOINTS, targets, targets[0])
+    bare = replay(fixed_in_the_air(export(without_effects(result), "mjcf").text), JOINTS, targets, targets[0])
+    assert np.abs(found - expected).max() < 3e-6 < 1e-3 < np.abs(bare - expected).max()
+
+
 def test_the_actuators_give_the_drives_torque(result):
     """To 1e-5 of the root mean square torque, on one random sequence; gains and limits with the effects on them."""
     path = changed(result, effects=["torque_gain"], delay_s=0.0)
@@ -250,9 +262,11 @@ def result_of(folder: Path, model: Path, cfg, parameters: dict, drive: dict) -> 
 
 
 @pytest.mark.parametrize(
-    ("stiff", "gains", "error"), [(True, {}, 2e-5), (False, HELD, 1.5e-4)], ids=["continuous", "held"]
+    ("stiff", "gains", "soft", "error"),
+    [(True, {}, 0.0, 2e-5), (False, HELD, 0.0, 1.5e-4), (True, {}, 0.02, 4e-5), (False, HELD, 0.02, 1.5e-4)],
+    ids=["continuous", "held", "continuous, soft", "held, soft"],
 )
-def test_what_steps_of_second_order_identified_moves_so_in_plain_steps(tmp_path, stiff, gains, error):
+def test_what_steps_of_second_order_identified_moves_so_in_plain_steps(tmp_path, stiff, gains, soft, error):
     """Four steps per control step, as fits of model files take; the held torques' error is what kd's jerk leaves."""
     path = tmp_path / "arm.xml"
     path.write_text(STIFF if stiff else STIFF[: STIFF.index("  <actuator>")] + MOTORS)
@@ -270,7 +284,10 @@ def test_what_steps_of_second_order_identified_moves_so_in_plain_steps(tmp_path,
         "friction": of(0.5, 0.02),
         "encoder_bias": of(0.02, -0.03),
     }
+    if soft:
+        parameters |= {"friction": of(5.0, 0.5), "soft_friction.time_constant": {"all": soft}}
     result = result_of(tmp_path, path, cfg, parameters, {**stated, "effort_limit": of(150.0, 28.0), **flags})
+    changed(result, effects=["soft_friction"] if soft else [])
     targets = 0.4 * chirp(2)
     expected, _ = identified_motion(result, targets)
     exported = export(result, "mjcf")

@@ -62,6 +62,25 @@ def test_friction_under_load_is_what_it_is_on_the_robot(payload):
     assert float((moved_by(twins, sought)[:, 0] - torch.as_tensor(recording.dof_pos)).abs().max()) < 3e-4
 
 
+def test_soft_friction_is_what_it_is_on_the_robot():
+    """MuJoCo scales it by what the whole robot lets a torque do, not by the joint's inertia alone."""
+    fine = env_cfg(ANYMAL)
+    set_physics_dt(fine, 0.00025)
+    fine.set_effects(["soft_friction"])
+    truth = {**TRUTH, "friction": 4.0, "soft_friction.time_constant": 0.02}
+    recording = replayed(legs_chirp(fine, 0.5), truth, fine)
+    plain = make_problem(recording, cfg=env_cfg(ANYMAL))
+    whole = plain.with_effects(["soft_friction"])
+    sought = whole.space.from_dict(truth)
+    path = reference_path(whole.with_physics_dt(0.00025), sought)
+    twins = twin_problem(whole, path).with_physics_dt(0.0025 / 3)
+    measured = torch.as_tensor(recording.dof_pos)
+    assert float((moved_by(twins, sought)[:, 0] - measured).abs().max()) < 3e-4
+    hard = twin_problem(plain, path).with_physics_dt(0.0025 / 3)
+    without = plain.space.from_dict({**TRUTH, "friction": 4.0})
+    assert float((moved_by(hard, without)[:, 0] - measured).abs().max()) > 3e-3
+
+
 def test_a_joint_s_own_payload_is_that_of_its_link_alone():
     cfg = env_cfg(ANYMAL)
     problem = make_problem(record(legs_chirp(cfg, 0.05), TRUTH, cfg=cfg), cfg=cfg)
