@@ -8,7 +8,6 @@ import threading
 import time
 from typing import TextIO
 
-
 _TIMES = 3
 """Times that a line shows, at most, before it is written anew."""
 
