@@ -16,7 +16,7 @@ from pace_optim.run.summary import ABOVE_NOISE, next_line
 
 from ..markup import Section, bullets, folded, html
 from ..run_data import RunData
-from .verdict import headline, verdict_first
+from .verdict import headline, is_before, verdict_first
 
 _STOPPED_EARLY = ("max_iteration", "interrupted")
 
@@ -26,18 +26,21 @@ def overview(run: RunData) -> Section:
     result = run.result
     head = html(
         '<p class="eyebrow">{{ robot }} · {{ task }} · {{ folder }}</p><h1>{{ headline }}</h1>'
-        '<p class="lead">{{ verdict }}</p>{% if next %}<p>Next: <code>{{ next }}</code></p>{% endif %}',
+        '{% if before %}{{ diagnosed }}<h3>This run is the fit without it</h3>{% endif %}<p class="lead">{{ verdict }}'
+        "</p>{% if not before %}{{ diagnosed }}{% endif %}{% if next %}<p>Next: <code>{{ next }}</code></p>{% endif %}",
         robot=result.robot_name,
         task=result.task,
         folder=run.folder.resolve().name,
         headline=headline(run) or _plain_headline(result),
         verdict=_verdict(run),
+        diagnosed=verdict_first(run),
+        before=is_before(run),
         next=_next(run),
     )
     return Section(
         id="overview",
         title="Overview",
-        html=head + verdict_first(run) + _figures(result) + _warnings(result) + _errors_by_joint(result),
+        html=head + _figures(result) + _warnings(result) + _errors_by_joint(result),
     )
 
 
@@ -164,7 +167,10 @@ def _warnings(result: FitResult) -> Markup:
     said = bullets(sentences[:most])
     if rest := sentences[most:]:
         said += folded(len(rest), bullets(rest))
-    text = '<div class="callout bad"><h3>{{ title }}: read before you use the values</h3>{{ said }}</div>'
+    text = (
+        '<div class="callout bad"><h3>{{ title }}: read before you use the values '
+        "<small>(meaning and cure of each code: docs/faq.md)</small></h3>{{ said }}</div>"
+    )
     return html(text, title=title, said=said)
 
 

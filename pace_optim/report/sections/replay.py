@@ -78,8 +78,8 @@ def _about(looks: Looks | None) -> Markup:
         return Markup("")
     meshes = list(dict.fromkeys(mesh for own in looks.unread.values() for mesh in own))
     return html(
-        '<p class="replay-note">Plain rods stand for meshes that are missing, or neither STL, OBJ nor MSH: {{ meshes }} '
-        "({{ links }}).</p>",
+        '<p class="replay-note">Plain rods stand for meshes that are missing, or neither STL, OBJ nor MSH: '
+        "{{ meshes }} ({{ links }}).</p>",
         meshes=listed(meshes, _MESHES),
         links=listed(list(looks.unread), _MESHES),
     )

@@ -1,6 +1,7 @@
 """The report says what a run found, holds everything it needs, and draws in a browser."""
 
 import time
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from pace_actuators.text import duration, value_and_error
 from pace_optim.report import write_report
 from pace_optim.report.sections import SECTIONS
 from pace_optim.report.sections.correlation import strong_pairs
+from pace_optim.report.sections.failure import _apart, _log_step
 from pace_optim.report.sections.parameters import _beside, nice_ticks
 from pace_optim.report.sections.trajectories import samples_to_draw
 
@@ -194,6 +196,15 @@ def test_strong_pairs_are_found_once_and_strongest_first():
 def test_ticks_are_round_and_inside(low, high):
     ticks = nice_ticks(low, high)
     assert 2 <= len(ticks) <= 6 and low - 1e-12 <= ticks[0] and ticks[-1] <= high + 1e-12
+
+
+def test_ticks_of_a_figure_are_more_than_one_and_do_not_overlap():
+    assert _log_step([0.3, 1.0, 3.0]) == "D2" and _log_step([0.1, 90.0]) == 1
+    edges = ["−0.05", "−0.031", "−0.012", "−0.0038", "0.0038", "0.012", "0.031", "0.05"]
+    shown = [(i, text) for i, text in enumerate(_apart(edges, 9)) if text]
+    assert len(shown) >= 4
+    for (i, one), (j, other) in pairwise(shown):
+        assert (j - i) * 40 / 9 > 0.5 * (len(one) + len(other))
 
 
 def test_durations_read_well():

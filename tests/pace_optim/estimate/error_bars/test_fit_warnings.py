@@ -176,7 +176,8 @@ def test_parameters_without_influence_and_inseparable_ones_are_named():
     )
     told = fit_warnings(problem, physical(problem), uncertainty, FINE, ["delay/all"])
     assert len(told) == 2
-    assert "Not identified by these recordings: delay." in told[0]
+    assert told[0].startswith("These recordings do not show delay (kept at ") and " ms)" in told[0]
+    assert "To identify it, send steps or a fast chirp." in told[0]
     assert "cannot separate encoder bias and friction of servo" in told[1]
 
 
