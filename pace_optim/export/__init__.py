@@ -108,6 +108,6 @@ def _short_step(drives: IdentifiedDrives) -> list[str]:
     if at.physics_dt >= _SHORT:
         return []
     return [
-        f"A physics step of {1e3 * at.physics_dt:g} ms is slow in training. Fit once more at the step that you train at, "
-        f"as with --physics_dt {at.control_dt:g}, with the same effects, and export that run."
+        f"A physics step of {1e3 * at.physics_dt:g} ms is slow in training. Fit once more with the same effects and "
+        f"--physics_dt {at.control_dt:g} --drive_dt {at.control_dt:g}, and export that run."
     ]

@@ -6,7 +6,7 @@ import shutil
 import sys
 import threading
 import time
-from typing import TextIO
+from typing import ClassVar, TextIO
 
 _TIMES = 3
 """Times that a line shows, at most, before it is written anew."""
@@ -18,6 +18,9 @@ class ProgressLine:
     On a terminal one line is overwritten every second. Elsewhere a step has a line when it begins, and the time is
     added to that line every ten seconds; every third time the line is written anew, with the counter.
     """
+
+    last_written: ClassVar[ProgressLine | None] = None
+    """Whose line may be open."""
 
     def __init__(self, stream: TextIO | None = None, seconds_between_times: float = 10.0):
         """Start the clock."""
@@ -82,8 +85,14 @@ class ProgressLine:
 
     def tell(self, *lines: str) -> None:
         """Show lines that stay."""
+        self.end_line()
+        print(*lines, sep="\n", file=self._stream, flush=True)
+
+    def end_line(self) -> None:
+        """End a line that is open, as something else follows."""
         with self._lock:
-            print(*([""] if self._open else []), *lines, sep="\n", file=self._stream, flush=True)
+            if self._open and not self._stream.closed:
+                print(file=self._stream, flush=True)
             self._open = False
 
     def close(self) -> None:
@@ -91,8 +100,7 @@ class ProgressLine:
         if self._closed is not None:
             self._closed.set()
             self._closed = None
-        if self._open:
-            self.tell()
+        self.end_line()
         self._shown_step = ""
 
     def _run(self, text: str, step: str, now: bool = True) -> None:
@@ -128,5 +136,11 @@ class ProgressLine:
                 if self._open:
                     self._stream.write("\n")
                 self._stream.write(self._running + passed)
-            self._open = True
+            self._open, ProgressLine.last_written = True, self
             self._stream.flush()
+
+
+def end_line() -> None:
+    """End a line of progress that is open, before anything else is printed."""
+    if ProgressLine.last_written is not None:
+        ProgressLine.last_written.end_line()

@@ -4,9 +4,11 @@ import importlib
 import io
 import sys
 import time
+import warnings
 
 import pytest
 
+from pace_optim.terminal.cli import run_cli
 from pace_optim.terminal.progress import ProgressLine
 
 BETWEEN = 0.15
@@ -39,6 +41,16 @@ def test_a_line_of_a_file_is_ended_before_another_step_or_a_message():
     progress.say("writing")
     progress.close()
     assert stream.getvalue() == "fitting  0 s  0 s\nchecking  0 s\nnote: done\nwriting  0 s\n"
+
+
+def test_an_error_begins_a_line_of_its_own(capsys):
+    def main():
+        ProgressLine(sys.stderr, 60.0).say("reading")
+        sys.stderr.write(warnings.formatwarning("soon", UserWarning, "this.py", 1))  # as pytest catches them
+        raise ValueError("It is gone.")
+
+    assert run_cli(main) == 2
+    assert capsys.readouterr().err == "reading  0 s\nwarning: soon\nerror: It is gone.\n"
 
 
 class DoneError(Exception):
