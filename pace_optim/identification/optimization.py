@@ -513,7 +513,7 @@ class Optimization:
 
     @property
     def _search_name(self) -> str:
-        """What the progress calls the search: its scores are those of its own step."""
+        """What the progress calls the search, with its physics step where that is another than the fit's."""
         step = self.problem.for_search().physics_dt
         return "search" if step == self.problem.physics_dt else f"search with a physics step of {1e3 * step:.4g} ms"
 

@@ -57,7 +57,7 @@ def looks_of(path: Path) -> Looks:
 def _of_urdf(text: str, path: Path, unread: dict[str, list[str]]) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     for link in ElementTree.fromstring(text.strip().strip("\0")).findall("link"):
-        name, lost = link.get("name", ""), []
+        name, lost = link.get("name", ""), list[str]()
         body = spec.worldbody if name == spec.worldbody.name else spec.worldbody.add_body(name=name)
         shown = [_mesh(spec, body, part, path, lost) for part in link.findall("visual")]
         if not any(shown) and any([_mesh(spec, body, part, path, []) for part in link.findall("collision")]):
