@@ -57,7 +57,9 @@ def is_before(run: RunData) -> bool:
     """Whether another run has what was found to be missing in this one: then that run's error says more."""
     with run.blaming("diagnosis.json"):
         content = run.read_json("diagnosis.json")
-        return bool(content) and not _has_it(run.result, content) and _other_run(run, content) is not None
+        if not content:
+            return False
+        return not _has_it(run.result, content) and _other_run(run, content) is not None
 
 
 def _heading(run: RunData, content: dict[str, Any]) -> tuple[str, str]:
