@@ -62,7 +62,7 @@ def fit_warnings(
         *problem.contradictions,
         *problem.measured.warnings,
         *_overfit(rmse, change, problem.joint_types),
-        *_sampled_commands(problem, rmse, uncertainty),
+        *_sampled_commands(problem, physical, rmse, uncertainty),
         *_critical_delays(problem, physical),
         *_at_bounds(problem, physical, uncertainty),
         *_undetermined(problem, physical, left_open),
@@ -181,15 +181,18 @@ def _overfit(rmse: dict[str, dict[str, float]], change: float, joint_types: Sequ
     ]
 
 
-def _sampled_commands(problem: Problem, rmse: dict[str, dict[str, float]], uncertainty: Uncertainty) -> list[str]:
+def _sampled_commands(
+    problem: Problem, physical: torch.Tensor, rmse: dict[str, dict[str, float]], uncertainty: Uncertainty
+) -> list[str]:
     """Whether the drives seem to have got commands more often than they were logged.
 
     What is logged with slow samples is then early by half of the time between two commands on average: no delay that
     is 0 or more makes up for it, and the motion has none of the steps that held commands make.
     """
     slowest = max(r.sample_stride if r.des_time is None else 1 for r in problem.dataset.recordings)
-    low = problem.space.lower[problem.space["delay"]]
-    at_bound = f"delay/{GLOBAL}" in uncertainty.at_bound and float(low) == 0
+    of_delay = problem.space["delay"]
+    low, high, delay = (float(each[of_delay]) for each in (problem.space.lower, problem.space.upper, physical))
+    at_bound = f"delay/{GLOBAL}" in uncertainty.at_bound and low == 0 and delay < high / 2
     if slowest == 1 or not at_bound or (times_noise(problem, rmse["train"].get(ALL)) or 0.0) < FAR_ABOVE_NOISE:
         return []
     return [

@@ -158,6 +158,9 @@ def test_commands_count_as_logged_too_rarely_where_a_delay_of_none_is_too_late(o
     told = fit_warnings(problem, at, known(problem, at_bound=("delay/all", *others)), far)
     assert any("logged with the samples, every 20 ms" in each for each in told)
     assert any("At a bound: " in each for each in told)
+    late = physical(problem, {**TRUTH, "delay": 10.0})  # the other bound: the commands are early enough
+    told = fit_warnings(problem, late, known(problem, at_bound=("delay/all", *others)), far)
+    assert not any("logged with the samples" in each for each in told)
 
 
 def test_a_fit_whose_truth_is_beyond_a_bound_is_told():
