@@ -52,17 +52,15 @@ def _plain_headline(result: FitResult) -> str:
         return f"{result.times_noise:,.0f} times the noise: physics is missing"
     errors = result.rmse.get("validation") or result.rmse["train"]
     times = result.times_noise * errors[ALL] / result.rmse["train"][ALL]
-    where = "on data it was not fitted to" if result.rmse.get("validation") else "on the data it was fitted to"
+    where = "on held-out data" if result.rmse.get("validation") else "on the training data"
     return f"{times:.2g} times the noise {where}" if times >= ABOVE_NOISE else f"At the noise {where}"
 
 
 def _follows(result: FitResult) -> str:
     error = result.rmse.get("validation", {}).get(ALL)
     if error is not None:
-        return f"The simulation follows the robot to {_of_all(result, error)} on data it was not fitted to"
-    return (
-        f"The simulation follows the robot to {_of_all(result, result.rmse['train'][ALL])} on the data it was fitted to"
-    )
+        return f"The held-out error is {_of_all(result, error)}"
+    return f"The training error is {_of_all(result, result.rmse['train'][ALL])}"
 
 
 def _of_all(result: FitResult, error: float | None) -> str:
@@ -73,12 +71,12 @@ def _verdict(run: RunData) -> str:
     train = run.result.rmse["train"].get(ALL)
     held_out = run.result.rmse.get("validation", {}).get(ALL)
     share = _share_of_motion(run, held_out is not None)
-    part = "" if share is None else f", {_percent(share)} of how far they move"
-    sentences = [f"{_follows(run.result)}: the root mean square over all joints{part}."]
+    part = "" if share is None else f", {_percent(share)} of the motion"
+    sentences = [f"{_follows(run.result)} (RMS of all joints){part}."]
     if held_out is None:
         sentences.append("Nothing was kept for validation, so this says little of other motions.")
     else:
-        sentences.append(f"On the data it was fitted to, it is {_of_all(run.result, train)}.")
+        sentences.append(f"The training error is {_of_all(run.result, train)}.")
     if len(run.result.joint_names) > 1:
         worst, where = _worst_joint(run.result)
         sentences.append(f"The worst joint is {worst} with {position_text(where, [run.result.joint_type(worst)])}.")

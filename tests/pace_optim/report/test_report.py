@@ -35,8 +35,8 @@ def test_it_names_every_joint_parameter_and_error(page):
         assert joint in page.text
     for words in ("Armature", "Viscous friction", "Friction", "Encoder bias", "Delay", "kg m²"):
         assert words in page.text
-    assert "follows the robot to 4.3 mrad on data it was not fitted to" in page.text
-    assert "On the data it was fitted to, it is 3.1 mrad." in page.text
+    assert "The held-out error is 4.3 mrad (RMS of all joints)" in page.text
+    assert "The training error is 3.1 mrad." in page.text
     assert "The worst joint is ankle with 6.1 mrad." in page.text
     assert "12.50 0.25 ms 0 25" in page.text and "5 control steps of 2.5 ms" in page.text  # the delay
     assert "at its upper bound" in page.text and "cannot be separated from encoder bias" in page.text
@@ -102,7 +102,7 @@ def test_without_validation_it_says_how_little_that_says(tmp_path):
         recording["train"] = torch.ones_like(recording["train"])
     write_tensors(folder / "best_trajectory.pt", content)
     text = page_of(folder).text
-    assert "follows the robot to 3.1 mrad on the data it was fitted to" in text
+    assert "The training error is 3.1 mrad (RMS of all joints)" in text
     assert "Nothing was kept for validation" in text
 
 
