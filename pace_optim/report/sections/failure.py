@@ -12,7 +12,7 @@ from markupsafe import Markup
 from pace_actuators.joint_units import JointType, joint_label, units_for
 from pace_actuators.text import position_text, position_unit, short_duration, three_figures
 
-from ..markup import Section, bullets, choice, html, json_script, table
+from ..markup import Section, bullets, choice, html, json_script, log_step, table
 from ..run_data import RunData
 
 
@@ -273,7 +273,7 @@ def _spectrum(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str,
     return {
         "text": text + " Each point is a third of an octave.",
         "traces": [{"x": centre, "y": rms}, {"x": centre, "y": noise}],
-        "layout": {"xaxis": {"dtick": _log_step(centre)}, "yaxis": _title(f"error [{unit}]")},
+        "layout": {"xaxis": {"dtick": log_step(centre)}, "yaxis": _title(f"error [{unit}]")},
     }
 
 
@@ -297,13 +297,7 @@ def _response(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str,
         for key in ("magnitude_db", "phase_deg", "coherence")
         for of in ("measured", "model")
     ]
-    return {"text": text, "traces": traces, "layout": {"xaxis": {"dtick": _log_step(frequency)}}}
-
-
-def _log_step(values: Sequence[float | None]) -> float | str:
-    """Ticks of a logarithmic axis: one for each decade, or 1, 2, 5 where that would leave one or two."""
-    known = [value for value in values if value]
-    return 1 if not known or max(known) > 30 * min(known) else "D2"
+    return {"text": text, "traces": traces, "layout": {"xaxis": {"dtick": log_step(frequency)}}}
 
 
 def _response_traces() -> list[dict[str, Any]]:

@@ -13,9 +13,10 @@ from run_folders import JOINTS, LABELS, make_result, make_trajectory, write_run
 from pace_actuators.files import write_json, write_tensors
 from pace_actuators.text import duration, value_and_error
 from pace_optim.report import write_report
+from pace_optim.report.markup import log_step
 from pace_optim.report.sections import SECTIONS
 from pace_optim.report.sections.correlation import strong_pairs
-from pace_optim.report.sections.failure import _apart, _log_step
+from pace_optim.report.sections.failure import _apart
 from pace_optim.report.sections.parameters import _beside, nice_ticks
 from pace_optim.report.sections.trajectories import samples_to_draw
 
@@ -199,7 +200,7 @@ def test_ticks_are_round_and_inside(low, high):
 
 
 def test_ticks_of_a_figure_are_more_than_one_and_do_not_overlap():
-    assert _log_step([0.3, 1.0, 3.0]) == "D2" and _log_step([0.1, 90.0]) == 1
+    assert log_step([0.3, 1.0, 3.0]) == "D2" and log_step([0.1, 90.0]) == 1
     edges = ["−0.05", "−0.031", "−0.012", "−0.0038", "0.0038", "0.012", "0.031", "0.05"]
     shown = [(i, text) for i, text in enumerate(_apart(edges, 9)) if text]
     assert len(shown) >= 4
