@@ -318,7 +318,7 @@ def hint_sentences(hints: Sequence[Hint], joint_names: Sequence[str]) -> list[st
         ]
         doubts = [f"{d} ({', '.join(apart)})" if d == DIFFERS and apart else d for d in hint.doubts]
         what = f"{hint.effect} ({sizes})" if sizes else hint.effect
-        said.append(f"Nearest to it on {joint_names[hint.joint]} is {what}, but {' and '.join(doubts)}.")
+        said.append(f"Hint on {joint_names[hint.joint]}: {what}. It is not named, as {' and '.join(doubts)}.")
     return said
 
 

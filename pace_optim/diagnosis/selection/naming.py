@@ -61,7 +61,7 @@ DIFFERS = "its size differs between recordings"
 
 
 def doubts(evidence: Evidence, *, cfg: DiagnosisCfg = DEFAULT) -> list[str]:
-    """What speaks against naming an effect, each to be read after "but"; none where its name is earned.
+    """What speaks against naming an effect, each to be read after "as"; none where its name is earned.
 
     An effect is named where it explains more than it leaves of what lies above the floor. Its size must be one that
     drives have, and surely not zero by its error bars. Where its joint does not end near the floor, its size must also

@@ -316,7 +316,7 @@ def test_what_is_unknown_is_told_with_what_comes_nearest(bench):
     hint = Hint(effect="parallel_spring", joint=0, explained=0.75, doubts=["it is at a bound", "no drive has it"])
     said = summary_of(told_of(outcome, "unknown", {SPRING: 1.0}, [hint]), bench.problem)
     assert said.startswith("Something is missing, and no known effect has earned its name: the validation error is 10 ")
-    assert said.endswith("Nearest to it on servo is parallel_spring, but it is at a bound and no drive has it.")
+    assert said.endswith("Hint on servo: parallel_spring. It is not named, as it is at a bound and no drive has it.")
 
 
 def test_a_hint_has_its_size_and_how_far_that_goes_apart(bench):
@@ -325,7 +325,7 @@ def test_a_hint_has_its_size_and_how_far_that_goes_apart(bench):
     hint = Hint(effect="parallel_spring", joint=0, explained=0.75, doubts=[DIFFERS], sizes=far)
     found = told_of(ended(bench, 5e-3, (SPRING, [True], [2.0, 0.1])), "unknown", {SPRING: 1.0}, [hint])
     assert summary_of(found, bench.problem).endswith(
-        "Nearest to it on servo is parallel_spring (stiffness 2 ± 0.1 N m/rad), but its size differs between "
+        "Hint on servo: parallel_spring (stiffness 2 ± 0.1 N m/rad). It is not named, as its size differs between "
         "recordings (stiffness 1.5 to 2.5 N m/rad)."
     )
 
