@@ -104,7 +104,7 @@ def doubts(cfg: ManagerBasedEnvCfg, identified: IdentifiedDrives | str | Path) -
     if drives.undetermined:
         found.append(
             f"{listed(sorted(drives.undetermined), _MOST)} was not determined by the recordings and keeps its prior. "
-            "Record a motion that shows it, or train with --randomize_identified 1. [W24]"
+            "Record a motion that shows it. [W24]"
         )
     return found + _other_drives(cfg.scene.robot, drives)
 

@@ -32,6 +32,9 @@ PUBLIC = ("pace_optim", "pace_envs", "pace_envs/managers", "pace_envs/mdp", "pac
 """Folders whose exports the reference shows."""
 _LINK = re.compile(r"(!?)\[([^\]\[]*(?:\[[^\]]*\][^\]\[]*)*)\]\((?!https?:|mailto:|#)([^)\s#]+)(#[^)\s]*)?\)")
 
+_CODE = re.compile(r"`[^`\n]+`")
+"""GitHub needs ``\\|`` in a table's code; here it is not needed, and its backslash would show."""
+
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages that do not lie in docs/."""
@@ -62,7 +65,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
             return text if not mark else f"`{target}`"
         return f"{mark}[{text}]({posixpath.relpath(wanted, posixpath.dirname(uri) or '.')}{anchor or ''})"
 
-    return _LINK.sub(link, markdown)
+    return _CODE.sub(lambda code: code[0].replace("\\|", "|"), _LINK.sub(link, markdown))
 
 
 def effect_pages() -> dict[str, str]:

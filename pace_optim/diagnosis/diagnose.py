@@ -81,7 +81,7 @@ def diagnose(
         cfg=settings.cfg,
         fits=fits,
     )
-    diagnosis = told(found, fits, wrong, problem, result, folder, candidates)
+    diagnosis = told(found, fits, wrong, problem, result, run.settings, folder, candidates)
     diagnosis = replace(diagnosis, wall_time_s=time.monotonic() - begin)
     _save(diagnosis, decisions)
     progress.close()
@@ -98,7 +98,7 @@ def diagnose(
         if not _stands(tried, found, result, fitted):
             continue
         if tried is not found:
-            diagnosis = told(tried, fits, wrong, problem, result, folder, candidates)
+            diagnosis = told(tried, fits, wrong, problem, result, run.settings, folder, candidates)
         diagnosis = with_refit(diagnosis, tried, wrong, problem, result, fitted, path)
         diagnosis = replace(diagnosis, wall_time_s=time.monotonic() - begin)
         _save(diagnosis, decisions)

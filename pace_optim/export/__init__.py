@@ -66,6 +66,8 @@ FORMATS: dict[str, Callable[[IdentifiedDrives], tuple[str, list[str]]]] = {
     "json": _json,
 }
 """Format -> what writes it."""
+_SHORT = 0.001
+"""Physics steps that are shorter are impractical in training [s]."""
 _OF_JOINTS = ("mjlab", "mjlab_native", "isaaclab", "newton")
 """Formats of simulators in which a drive is one of a joint."""
 
@@ -97,4 +99,15 @@ def export(path: str | Path, fmt: str, *, joints_only: bool = False, task: str |
     text, notes = mjcf(drives, joints_only=True) if joints_only else FORMATS[fmt](drives)
     if fmt in _OF_JOINTS:
         notes = [*notes, *pulled_notes(drives)]
-    return Export(text=text, notes=[*doubts_of_fit(drives), *notes])
+    return Export(text=text, notes=[*doubts_of_fit(drives), *_short_step(drives), *notes])
+
+
+def _short_step(drives: IdentifiedDrives) -> list[str]:
+    """How to train with values that belong to a physics step which is too short for that."""
+    at = drives.at
+    if at.physics_dt >= _SHORT:
+        return []
+    return [
+        f"A physics step of {1e3 * at.physics_dt:g} ms is slow in training. Fit once more with the same effects and "
+        f"--physics_dt {at.control_dt:g} --drive_dt {at.control_dt:g}, and export that run."
+    ]

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from pace_actuators.effects import effect_cfgs
+from pace_actuators.joint_units import units_for
 from pace_optim.estimate.cmaes_optimizer import CMAESOptimizer
 from pace_optim.estimate.comb_scan import scanned
 from pace_optim.estimate.derivatives import colour
@@ -457,7 +458,7 @@ class Optimization:
         self._searched = True
         loop = self.problem.loop_dt if self.problem.assumes_loop_rate else None
         self.processes.agree((self.settings, self._around, optimizer.history, optimizer.line_generation, loop))
-        self.progress.say(f"search: {optimizer.population_size} candidates in a generation")
+        self.progress.say(f"{self._search_name}: {optimizer.population_size} candidates in a generation")
         search(optimizer, self.searcher.rollout(optimizer.num_shown), after_generation)
         optimizer.close()
         self._search_stop = optimizer.stop_reasons
@@ -477,7 +478,8 @@ class Optimization:
         history.search_time_s.append(self.progress.elapsed)
         self.log.log_generation(optimizer)
         spread = float(optimizer.spread.max())
-        self.progress.show("search", optimizer.generation, cfg.max_iteration, optimizer.best_score, spread, self.steps)
+        error = self._in_words(optimizer.best_score)
+        self.progress.show(self._search_name, optimizer.generation, cfg.max_iteration, error, spread, self.steps)
         self._keep_process(optimizer)
         if optimizer.generation % cfg.save_interval == 0:
             self._write_mean(optimizer)
@@ -494,7 +496,7 @@ class Optimization:
             self.folder.write_progress({name: torch.stack(values) for name, values in self._saved.items()})
 
     def _after_iteration(self, descents: Sequence[Descent]) -> None:
-        now = next((d for d in descents if not d.stop_reason), descents[-1])
+        number, now = max((i, d) for i, d in enumerate(descents, start=1) if i == 1 or d.iteration)
         best, on_pieces = min(d.score for d in descents), now.stage.endswith(PIECES)
         cfg = self.way.cfg.on_pieces if on_pieces else self.way.cfg.on_whole
         if not on_pieces:
@@ -504,9 +506,23 @@ class Optimization:
             self.history.refine_time_s.append(self.progress.elapsed)
             self.log.log_refinement(now.iteration, best)
         name = "fit on pieces" if on_pieces else "fit on whole recordings"
-        self.progress.show(name, now.iteration, cfg.max_iteration, best, None, self.steps)
+        name += f" from start {number}" if number > 1 else ""
+        self.progress.show(name, now.iteration, cfg.max_iteration, self._in_words(now.score), None, self.steps)
         self.folder.write_mean(self.history.iterations, self.problem.space.to_physical(self._best_so_far()))
         self._write_checkpoint()
+
+    @property
+    def _search_name(self) -> str:
+        """What the progress calls the search, with its physics step where that is another than the fit's."""
+        step = self.problem.for_search().physics_dt
+        return "search" if step == self.problem.physics_dt else f"search with a physics step of {1e3 * step:.4g} ms"
+
+    def _in_words(self, score: float) -> str:
+        """A score of positions [rad²] as the error of all joints [mrad]; another one as it is."""
+        if self.settings.has_own_objective or self.problem.dataset.torques is not None:
+            return f"score {score:.3e}"
+        error = 1e3 * (score / len(self.problem.joint_names)) ** 0.5
+        return units_for(f"error {error:.3g} mrad", self.problem.joint_types)
 
     def refuse_divergence(self, score: float) -> None:
         """Refuse a best candidate that diverges.

@@ -108,6 +108,12 @@ def figure(
     )
 
 
+def log_step(values: Iterable[float | None]) -> float | str:
+    """Ticks of a logarithmic axis, as plotly's ``dtick``: one for each decade, or 1, 2, 5 where these would be few."""
+    known = [value for value in values if value and value > 0 and math.isfinite(value)]
+    return 1 if not known or max(known) > 30 * min(known) else "D2"
+
+
 def choice(name: str, entries: Sequence[str], group: str = "", at: int = 0) -> Markup:
     """Radio buttons that look like pills: arrow keys go from one to the next.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ from pace_envs.task_source import EnvironmentRecord
 from pace_optim.problem.unknown_facts import check_unknown
 from pace_optim.recording import without_fact_files
 from pace_optim.terminal.choices import OPTIMIZERS
+from pace_optim.terminal.cli import command
 
 
 @dataclass(kw_only=True)
@@ -209,3 +212,25 @@ class SettingsFile:
 
     resolved: dict[str, Any] = field(default_factory=dict)
     """The whole configuration as data."""
+
+
+_WITHOUT_FLAG = ("start", "check_consistency", "instead_of")
+"""Settings that no flag of the same name makes."""
+
+
+def command_line(settings: Mapping[str, Any]) -> str:
+    """The command line of settings as data; what is left at its default is left out."""
+    words = ["python", *command("fit").split()]
+    words = words if words[1].endswith(".py") else words[1:]
+    usual = FitSettings(task="").to_dict()
+    flags = {name: value for name, value in settings.items() if name not in _WITHOUT_FLAG and value != usual.get(name)}
+    flags["no_consistency"] = settings.get("check_consistency") is False
+    for name, value in flags.items():
+        if value is None or value is False:
+            continue
+        words.append(f"--{name}")
+        if isinstance(value, list):
+            words += [str(entry) for entry in value]
+        elif value is not True:
+            words.append(str(value))
+    return shlex.join(words)

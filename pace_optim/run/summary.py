@@ -49,7 +49,8 @@ def summary(result: FitResult) -> list[str]:
         f"stopped: {'; '.join(result.stop_reasons)}"
     )
     lines += [f"note: {finding}" for finding in result.findings]
-    return lines + [f"warning: {warning}" for warning in shortened(result.warnings, "warning")]
+    lines += [f"warning: {warning}" for warning in shortened(result.warnings, "warning")]
+    return lines + ["meaning and cure of each code: docs/faq.md"] * any("[W" in warning for warning in result.warnings)
 
 
 def error_line(result: FitResult, of: str = "error, all joints") -> str:

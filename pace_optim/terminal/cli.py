@@ -26,6 +26,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
+from pace_optim.terminal.progress import end_line
+
 _LONGEST_WORD = 300
 _PLAIN = {"×": "x", "→": "->", "−": "-", "–": "-", "…": "...", "²": "^2", "³": "^3", "·": "*", "°": " deg", "±": "+/-"}
 """How a terminal without these characters shows them."""
@@ -53,11 +55,16 @@ def safe_streams() -> Iterator[None]:
     """
     before = sys.stdout, sys.stderr, warnings.formatwarning
     sys.stdout, sys.stderr = (_Screen(_open(stream)) for stream in before[:2])  # type: ignore[assignment]
-    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"  # type: ignore[assignment]
+    warnings.formatwarning = _formatted  # type: ignore[assignment]
     try:
         yield
     finally:
         sys.stdout, sys.stderr, warnings.formatwarning = before
+
+
+def _formatted(message: Warning | str, *_: Any, **__: Any) -> str:
+    end_line()
+    return f"warning: {message}\n"
 
 
 def _open(stream: TextIO | None) -> TextIO:
@@ -210,6 +217,7 @@ def _run(main: Callable[[], int | None]) -> int:
         sys.stdout.flush()
         return status
     except KeyboardInterrupt:
+        end_line()
         print("interrupted", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:  # the reader of our output has gone, as `head` does
@@ -219,6 +227,7 @@ def _run(main: Callable[[], int | None]) -> int:
         if os.environ.get("PACE_TRACEBACK"):
             raise
         _drop_output(unless_it_can=True)
+        end_line()
         print(f"error: {one_line(as_called(sentence(error)))}", file=sys.stderr)
         return USER_ERROR if is_of_input(error) or own_code(error) else FAULT
 

@@ -6,46 +6,57 @@ import shutil
 import sys
 import threading
 import time
-from typing import TextIO
+from typing import ClassVar, TextIO
+
+_TIMES = 3
+"""Times that a line shows, at most, before it is written anew."""
 
 
 class ProgressLine:
     """Shows what runs and for how long.
 
-    On a terminal one line is overwritten every second. Elsewhere a line is printed every ten seconds, and at once when
-    a step without a counter begins.
+    On a terminal one line is overwritten every second. Elsewhere a step has a line when it begins, and the time is
+    added to that line every ten seconds; every third time the line is written anew, with the counter.
     """
 
-    def __init__(self, stream: TextIO | None = None, seconds_between_lines: float = 10.0):
+    last_written: ClassVar[ProgressLine | None] = None
+    """Whose line may be open."""
+
+    def __init__(self, stream: TextIO | None = None, seconds_between_times: float = 10.0):
         """Start the clock."""
         self._stream = stream or sys.stderr
         self._live = self._stream.isatty()
-        self._between = seconds_between_lines
+        self._between = seconds_between_times
         self._lock = threading.Lock()
-        self._running, self._open = "", False
+        self._running, self._step, self._shown_step, self._open = "", "", "", False
         self._closed: threading.Event | None = None
+        self._began, self._last, self._times = time.perf_counter(), 0.0, 0
         self.restart()
 
     def restart(self) -> None:
-        """Start the clock anew, for a fit that begins now."""
+        """Start the clock of a fit that begins now; the time that is shown goes on."""
         self._start = time.perf_counter()
-        self._last_line = 0.0
         self._phase = ""
         self._phase_began = self._latest = (0.0, 0)
 
     @property
     def elapsed(self) -> float:
-        """Time since the start [s]."""
+        """Time since the last restart [s]."""
         return time.perf_counter() - self._start
 
-    def show(self, phase: str, done: int, total: int, best: float, spread: float | None, steps: int) -> None:
+    @property
+    def shown(self) -> float:
+        """Time since the line was made, which is shown [s]."""
+        return time.perf_counter() - self._began
+
+    def show(self, phase: str, done: int, total: int, error: str, spread: float | None, steps: int) -> None:
         """Update the line. It states no remaining time: when an optimizer converges is not known.
 
         Args:
             phase: What runs.
             done: Iterations so far in this phase.
             total: Most iterations in this phase.
-            best: Best score so far [rad², of slides m²].
+            error: Smallest error so far in this phase, with its unit.
             spread: Widest standard deviation of the search, normalised; ``None`` without a search.
             steps: Simulated steps so far.
         """
@@ -55,27 +66,33 @@ class ProgressLine:
         self._latest = (elapsed, steps)
         seconds, own_steps = elapsed - self._phase_began[0], steps - self._phase_began[1]
         text = (
-            f"{phase}: {done}/{total} at most  best {best:.3e}"
+            f"{phase}: {done}/{total} at most  {error}"
             + ("" if spread is None else f"  spread {spread:.2g}")
             + f"  {own_steps / max(seconds, 1e-9) / 1e3:.0f}k steps/s"
         )
-        self._run(text, now=self._live or elapsed - self._last_line >= self._between or done == total)
+        self._run(text, phase, now=self._live or phase != self._shown_step)
 
     def say(self, text: str) -> None:
         """Show a step that has no counter."""
         self._latest = (self.elapsed, self._latest[1])
-        self._run(text)
+        self._run(text, text)
 
     def wait_for(self, text: str) -> None:
         """Show a step that is usually short: only where it takes long."""
         self._latest = (self.elapsed, self._latest[1])
-        self._last_line = self.elapsed
-        self._run(text, now=False)
+        self._last = self.shown
+        self._run(text, text, now=False)
 
     def tell(self, *lines: str) -> None:
         """Show lines that stay."""
+        self.end_line()
+        print(*lines, sep="\n", file=self._stream, flush=True)
+
+    def end_line(self) -> None:
+        """End a line that is open, as something else follows."""
         with self._lock:
-            print(*([""] if self._open else []), *lines, sep="\n", file=self._stream, flush=True)
+            if self._open and not self._stream.closed:
+                print(file=self._stream, flush=True)
             self._open = False
 
     def close(self) -> None:
@@ -83,35 +100,47 @@ class ProgressLine:
         if self._closed is not None:
             self._closed.set()
             self._closed = None
-        if self._open:
-            self.tell()
+        self.end_line()
+        self._shown_step = ""
 
-    def _run(self, text: str, now: bool = True) -> None:
-        """Show what runs from now on, until the next text or the end."""
-        self._running = text
-        if now:
+    def _run(self, text: str, step: str, now: bool = True) -> None:
+        """Show what runs from now on, until the next text or the end; a counter's line waits for its turn."""
+        self._running, self._step = text, step
+        if now or self.shown - self._last >= self._between:
             self._write()
         if self._closed is None:
             self._closed = threading.Event()
             threading.Thread(target=self._repeat, args=(self._closed,), daemon=True).start()
 
     def _repeat(self, closed: threading.Event) -> None:
-        """Write the line again while it stays the same, with the time."""
+        """Write the time again while nothing else is written."""
         between = 1.0 if self._live else self._between
-        while not closed.wait(max(0.1, self._last_line + between - self.elapsed)) and not self._stream.closed:
-            if self.elapsed - self._last_line >= between:
+        while not closed.wait(max(0.1, self._last + between - self.shown)) and not self._stream.closed:
+            if self.shown - self._last >= between:
                 self._write()
 
     def _write(self) -> None:
         """The line as it is now."""
         with self._lock:
-            self._last_line = self.elapsed
-            text = f"{self._running}  {self._last_line:.0f} s"
+            self._last = self.shown
+            passed = f"  {self._last:.0f} s"
             if self._live:
                 width = shutil.get_terminal_size().columns - 1
                 self._stream.write("\r")
-                self._stream.write(text[:width].ljust(width))
-                self._open = True
+                self._stream.write((self._running + passed)[:width].ljust(width))
+            elif self._open and self._step == self._shown_step and self._times < _TIMES:
+                self._times += 1
+                self._stream.write(passed)
             else:
-                self._stream.write(text + "\n")
+                self._shown_step, self._times = self._step, 1
+                if self._open:
+                    self._stream.write("\n")
+                self._stream.write(self._running + passed)
+            self._open, ProgressLine.last_written = True, self
             self._stream.flush()
+
+
+def end_line() -> None:
+    """End a line of progress that is open, before anything else is printed."""
+    if ProgressLine.last_written is not None:
+        ProgressLine.last_written.end_line()

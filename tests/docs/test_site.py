@@ -48,6 +48,7 @@ def test_the_site_has_a_page_for_each_effect_and_the_reference(site):
             assert name in (site / "effects" / f"{name}.html").read_text("utf-8")
     gallery = (site / "effects" / "index.html").read_text("utf-8")
     assert gallery.count("images/effects/") == len(drawn_effects())
+    assert "|dq*/dt| &lt;= v_max" in (site / "effects.html").read_text("utf-8")  # no backslash of GitHub's tables
     reference = (site / "reference.html").read_text("utf-8")
     for name in ("PaceDCMotor", "ManagerBasedRLEnv", "Recording", "load_problem"):
         assert f">{name}<" in reference or f"{name}</" in reference, f"the reference has no {name}"

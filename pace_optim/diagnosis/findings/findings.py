@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -12,14 +12,15 @@ from typing import Any
 import torch
 
 from pace_actuators.drive_result import ALL
-from pace_actuators.effects import Effect, get_effect
+from pace_actuators.effects import Effect, EffectCfg, get_effect
 from pace_actuators.files import json_text
 from pace_actuators.joint_units import units_for
-from pace_actuators.text import conjoined
+from pace_actuators.text import conjoined, size_text
 from pace_optim.diagnosis.checks.data_check import DataCheck
 from pace_optim.diagnosis.findings.advice import advise
 from pace_optim.diagnosis.findings.result import Diagnosis
 from pace_optim.diagnosis.search.state import Outcome
+from pace_optim.diagnosis.selection.naming import DIFFERS
 from pace_optim.diagnosis.verdict.free_curves import Curves, error_map
 from pace_optim.diagnosis.verdict.names import Hint, new_effects
 from pace_optim.diagnosis.verdict.refit import Evidences, judged_again, on_whole_robot
@@ -31,6 +32,7 @@ from pace_optim.joints.fits.labels import labels
 from pace_optim.joints.fits.model import JointModel
 from pace_optim.problem.problem import Problem
 from pace_optim.run.result import FitResult
+from pace_optim.run.settings import FitSettings, command_line
 
 _LEAST_TOLD = 0.1
 """Smaller shares are printed as below this [%]."""
@@ -108,6 +110,7 @@ def told(
     wrong: LinkFindings,
     problem: Problem,
     run: FitResult,
+    settings: FitSettings,
     folder: Path,
     candidates: Sequence[type[Effect]],
 ) -> Diagnosis:
@@ -124,7 +127,10 @@ def told(
         likes=likes(found.outcome),
         data=[*_about_links(wrong, problem), *found.data.sentences, *_about_run(found, problem, run)],
         absorbed={effect.name: effect.absorbed_by for effect in found.absorbed},
-        advice=advise(problem, found.outcome, found.verdict, found.data, found.absorbed),
+        advice=[
+            *to_try(found, run, settings.to_dict()),
+            *advise(problem, found.outcome, found.verdict, found.data, found.absorbed),
+        ],
         runs=[str(folder)],
         tried=[effect.name for effect in candidates],
         physics_dt=problem.physics_dt,
@@ -301,11 +307,36 @@ def summary_of(found: Findings, problem: Problem) -> str:
 
 
 def hint_sentences(hints: Sequence[Hint], joint_names: Sequence[str]) -> list[str]:
-    """What comes nearest on joints where no effect has earned its name, and what speaks against it."""
-    return [
-        f"Nearest to it on {joint_names[hint.joint]} is {hint.effect}, but {' and '.join(hint.doubts)}."
-        for hint in hints
+    """What comes nearest on joints where no effect has earned its name, how large, and what speaks against it."""
+    said = []
+    for hint in hints:
+        sizes = ", ".join(f"{size['parameter']} {size_text(size)}" for size in hint.sizes)
+        apart = [
+            f"{size['parameter']} {size['apart'][0]:.3g} to {size['apart'][1]:.3g} {size['unit']}".removesuffix(" 1")
+            for size in hint.sizes
+            if size["apart"]
+        ]
+        doubts = [f"{d} ({', '.join(apart)})" if d == DIFFERS and apart else d for d in hint.doubts]
+        what = f"{hint.effect} ({sizes})" if sizes else hint.effect
+        said.append(f"Hint on {joint_names[hint.joint]}: {what}. It is not named, as {' and '.join(doubts)}.")
+    return said
+
+
+def to_try(found: Findings, run: FitResult, settings: Mapping[str, Any]) -> list[str]:
+    """The command that fits the whole robot with the hints too."""
+    if not found.hints:
+        return []
+    joints = {
+        effect.effect_class.name: list(effect.joints(found.joint_names))
+        for effect in map(EffectCfg.parse, [*run.effects, *found.added])
+    }
+    for hint in found.hints:
+        joints.setdefault(hint.effect, []).append(found.joint_names[hint.joint])
+    effects = [
+        EffectCfg(effect=name, joint_names_expr="|".join(own), shared=get_effect(name).shared).label
+        for name, own in joints.items()
     ]
+    return [f"To try the hints on the whole robot: {command_line({**settings, 'effects': effects, 'start': None})}"]
 
 
 def _missing(found: Findings) -> str:

@@ -57,8 +57,11 @@ class Evidence:
         return math.sqrt(max(0.0, self.uneven) * self.left / max(self.rise, 1e-30))
 
 
+DIFFERS = "its size differs between recordings"
+
+
 def doubts(evidence: Evidence, *, cfg: DiagnosisCfg = DEFAULT) -> list[str]:
-    """What speaks against naming an effect, each to be read after "but"; none where its name is earned.
+    """What speaks against naming an effect, each to be read after "as"; none where its name is earned.
 
     An effect is named where it explains more than it leaves of what lies above the floor. Its size must be one that
     drives have, and surely not zero by its error bars. Where its joint does not end near the floor, its size must also
@@ -74,7 +77,7 @@ def doubts(evidence: Evidence, *, cfg: DiagnosisCfg = DEFAULT) -> list[str]:
     far = evidence.left > near
     return [
         *(["its size is not significant"] if evidence.bars < SURE and (far or evidence.bars > 0) else []),
-        *(["its size differs between recordings"] if far and evidence.scatter > cfg.verdict.scatter else []),
+        *([DIFFERS] if far and evidence.scatter > cfg.verdict.scatter else []),
         *(["it is at a bound"] if far and evidence.at_bound else []),
         *(["no drive has such a value"] if evidence.implausible else []),
     ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from pace_actuators.effects import Effect
 from pace_optim.joints.fits.fitted import Fitted
 
 _RIDGE = 1e-9
@@ -46,6 +47,27 @@ def unevenness(now: Fitted) -> torch.Tensor:
     return result
 
 
+def sizes_apart(now: Fitted, effect: type[Effect], joint: int) -> torch.Tensor:
+    """An effect's sizes on a joint if each recording had its own, to first order, physical (R, parameters).
+
+    Halves of recordings stand for one or two recordings, as in :func:`unevenness`.
+    """
+    columns = now.model.columns(effect)
+    jacobian, error = _in_parts(now.free_jacobian)[..., joint].double(), now.error
+    if error is None:
+        raise ValueError("The sizes in each recording need a model that was fitted with keep_jacobian.")
+    alone = torch.diag_embed(jacobian[columns]).permute(0, 3, 1, 2)  # (own, R, K, R)
+    others = torch.cat([jacobian[: columns.start], jacobian[columns.stop :]])
+    both = torch.cat([alone.flatten(2).flatten(0, 1), others.flatten(1)])
+    moves = -_solved(both, _in_parts(error)[..., joint].double().flatten())
+    own = moves[: alone.shape[0] * alone.shape[1]].reshape(alone.shape[:2]).T
+    x = now.x[joint].repeat(len(own), 1)
+    x[:, columns] = (x[:, columns] + own).clamp(-1.0, 1.0)
+    whole = now.x.repeat(len(own), 1, 1)
+    whole[:, joint] = x
+    return torch.stack([now.model.to_physical(each)[joint, columns] for each in whole])
+
+
 def _in_parts(values: torch.Tensor) -> torch.Tensor:
     """Values (…, K, R, n) with halves of recordings in place of them, as long as there are no more than two."""
     while values.shape[-2] <= 2:
@@ -57,7 +79,13 @@ def _in_parts(values: torch.Tensor) -> torch.Tensor:
 
 def _left(columns: torch.Tensor, error: torch.Tensor) -> float:
     """Sum of squares of an error (K,) that columns (p, K) leave."""
-    columns = columns[columns.norm(dim=1) > 0]
-    columns = columns / columns.norm(dim=1, keepdim=True)
+    return float((error - _solved(columns, error) @ columns).square().sum())
+
+
+def _solved(columns: torch.Tensor, error: torch.Tensor) -> torch.Tensor:
+    """Factors (p,) of columns (p, K) that explain most of an error (K,); 0 of columns that are zero."""
+    norm = columns.norm(dim=1, keepdim=True)
+    norm[norm == 0] = torch.inf
+    columns = columns / norm
     gram = columns @ columns.T + _RIDGE * torch.eye(len(columns), dtype=columns.dtype)
-    return float((error - torch.linalg.solve(gram, columns @ error) @ columns).square().sum())
+    return torch.linalg.solve(gram, columns @ error) / norm[:, 0]

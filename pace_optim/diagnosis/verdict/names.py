@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
 import torch
 
@@ -12,8 +13,8 @@ from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.selection.decisions import Log, unlogged
 from pace_optim.diagnosis.selection.naming import Evidence, doubts
 from pace_optim.diagnosis.selection.rules import decide
-from pace_optim.diagnosis.selection.size_consistency import unevenness
-from pace_optim.diagnosis.verdict.sizes import error_bars_from_none
+from pace_optim.diagnosis.selection.size_consistency import sizes_apart, unevenness
+from pace_optim.diagnosis.verdict.sizes import error_bars_from_none, factor_of, standard_deviations
 from pace_optim.joints.fits.block_errors import BlockErrors
 from pace_optim.joints.fits.fits import Fits
 from pace_optim.joints.fits.fitted import Fitted
@@ -30,6 +31,9 @@ class Hint:
     """Part that it explains of what lies above the floor without it."""
     doubts: list[str]
     """What speaks against it."""
+    sizes: list[dict[str, Any]] = field(default_factory=list)
+    """Each of its parameters as in a diagnosis' ``sizes``, and ``apart``: the smallest and the largest value if each
+    recording had its own, if they are known."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,7 +98,7 @@ def earned_names(fits: Fits, outcome: Outcome, floor: torch.Tensor, log: Log = u
                     model, own = outcome.base, outcome.base_errors
                 if float(own.mse[j]) > (outcome.cfg.judging.far * float(floor[j])) ** 2:
                     failed = failed | here
-                    hints[j] = hint(weakest, j, every[weakest].evidence, outcome)
+                    hints[j] = hint(weakest, j, every[weakest].evidence, outcome, now)
                     model, own = outcome.final, outcome.final_errors
             now, errors = now.with_joints(here, model), errors.with_joints(here, own)
     return Names(
@@ -261,7 +265,41 @@ def _earned(effect: type[Effect], own: _LeftOut, outcome: Outcome, errors: Block
     return decide("name", list(own.evidence), errors, without, cfg=outcome.cfg, log=log, evidence=evidence)
 
 
-def hint(effect: type[Effect], joint: int, evidence: Mapping[int, Evidence], outcome: Outcome) -> Hint:
-    """An effect of a joint with what speaks against its name, of its evidence on all its joints."""
-    own = as_judged(effect, evidence)[joint]
-    return Hint(effect=effect.name, joint=joint, explained=own.explained, doubts=doubts(own, cfg=outcome.cfg))
+def hint(
+    effect: type[Effect],
+    joint: int,
+    evidence: Mapping[int, Evidence],
+    outcome: Outcome,
+    now: Fitted,
+    std: torch.Tensor | None = None,
+) -> Hint:
+    """An effect of a joint with its size and what speaks against its name.
+
+    Args:
+        effect: The effect.
+        joint: The joint.
+        evidence: Of the effect, on all its joints.
+        outcome: Where the search ended.
+        now: The model that has it.
+        std: Physical standard deviations, (n, P), zero without error bar; ``None``: from its Jacobian.
+    """
+    own, columns = as_judged(effect, evidence)[joint], now.model.columns(effect)
+    if std is None:
+        std = torch.zeros_like(now.x) if now.jacobian is None else standard_deviations(now)
+    apart = None if now.jacobian is None else sizes_apart(now, effect, joint)
+    sizes = [
+        {
+            "parameter": parameter.name,
+            "value": value,
+            "std": error or None,
+            "unit": parameter.unit,
+            "factor": factor_of(effect, parameter, value),
+            "at_bound": False,
+            "apart": None if apart is None else [float(apart[:, p].min()), float(apart[:, p].max())],
+        }
+        for p, (parameter, value, error) in enumerate(
+            zip(effect.parameters, now.physical[joint, columns].tolist(), std[joint, columns].tolist(), strict=True)
+        )
+    ]
+    doubted = doubts(own, cfg=outcome.cfg)
+    return Hint(effect=effect.name, joint=joint, explained=own.explained, doubts=doubted, sizes=sizes)

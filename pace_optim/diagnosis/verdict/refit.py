@@ -46,7 +46,8 @@ def judged_again(
         refit: The whole robot's fit.
     """
     now, before, after = outcome.final, outcome.base_errors.mse, outcome.final_errors.mse
-    bars = error_bars_from_none(now, _entries(outcome, joint_names, refit.std, torch.zeros_like(now.physical)))
+    std = _entries(outcome, joint_names, refit.std, torch.zeros_like(now.physical))
+    bars = error_bars_from_none(now, std)
     stuck, implausible = now.model.has_at_bounds(now.x, now.moves), now.model.implausible(now.physical)
     harm, far = harm_of(outcome), before.sqrt() > outcome.cfg.judging.far * floor
     stand: dict[tuple[type[Effect], int], Evidence] = {}
@@ -66,7 +67,7 @@ def judged_again(
             if each is effect
         }
         for j in evidence:
-            told = hint(effect, j, evidence, outcome)
+            told = hint(effect, j, evidence, outcome, replace(now, jacobian=None), std)
             if not told.doubts:
                 stand[effect, j] = evidence[j]
             elif bool(far[j]):

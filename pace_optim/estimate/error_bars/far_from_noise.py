@@ -60,7 +60,7 @@ def far_end(times: float | None, rmse: float, optimizer: str, joint_types: Seque
     )
     unit = units_for("mrad", joint_types)
     return [
-        f"The error of {1e3 * rmse:.3g} {unit} is {times:,.0f} times the measurement noise. Physics is missing, a fact "
-        f"of the drive is wrong, or the fit is in a local minimum. The error bars mean nothing.{search} "
-        f"{command('diagnose')} looks for the missing physics. [W1]"
+        f"The error of {1e3 * rmse:.3g} {unit} is {times:,.0f} times the measurement noise: the values make up for "
+        f"something else, and error bars mean nothing. First check gains, torque limits and loads.{search} "
+        f"Then {command('diagnose')} looks for the missing physics. [W1]"
     ]

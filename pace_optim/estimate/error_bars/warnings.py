@@ -23,6 +23,15 @@ _BY_EFFECT = (1, 19, 3, 2, 4, 5, 17, 18, 8, 7, 6, 9, 10, 11, 12, 13, 15)
 _OVERFIT_RATIO = 1.5
 _NAMED = 3
 """Joints that a sentence names, at most."""
+_SHOWN_BY = {
+    "armature": "accelerate it hard, as in a fast chirp",
+    "viscous_friction": "move it fast over long strokes",
+    "friction": "reverse it slowly and often",
+    "encoder_bias": "let gravity load it differently, in several postures (a vertical axis never shows its bias)",
+    "delay": "send steps or a fast chirp",
+}
+"""The motion that shows a parameter."""
+_OTHERWISE = "move it further, faster or with another load"
 _NOTHING = 1e-6
 """Errors below this are negligible [rad]."""
 _OF_THE_STEP = (0.3, 5.0)
@@ -53,10 +62,10 @@ def fit_warnings(
         *problem.contradictions,
         *problem.measured.warnings,
         *_overfit(rmse, change, problem.joint_types),
-        *_sampled_commands(problem, rmse, uncertainty),
+        *_sampled_commands(problem, physical, rmse, uncertainty),
         *_critical_delays(problem, physical),
         *_at_bounds(problem, physical, uncertainty),
-        *_undetermined(left_open),
+        *_undetermined(problem, physical, left_open),
         *_unsure(unsure),
         *_alike(uncertainty.indistinguishable),
         *_coarse_step(problem, rmse, change),
@@ -72,13 +81,15 @@ def by_effect(warnings: Iterable[str]) -> list[str]:
     return sorted(dict.fromkeys(warnings), key=place)
 
 
-def _undetermined(labels: Sequence[str]) -> list[str]:
-    """What the recordings leave open."""
+def _undetermined(problem: Problem, physical: torch.Tensor, labels: Sequence[str]) -> list[str]:
+    """What the recordings leave open, what its value is, and a motion that shows it."""
     if not labels:
         return []
+    values = {label: _with_unit(problem, label, float(physical[problem.space.labels.index(label)])) for label in labels}
+    kept = {value: [label for label in labels if values[label] == value] for value in values.values()}
     return [
-        f"Not identified by these recordings: {_named(labels)}. They have no influence, or an error bar as large as "
-        "the value, its bounds or its prior. Each keeps its prior or the model file's value; exports omit it. [W10]"
+        f"These recordings do not show {'; '.join(f'{_named(own)} (kept at {value})' for value, own in kept.items())}. "
+        f"Exports omit it. To identify it, {_motions(labels)}. [W10]"
     ]
 
 
@@ -87,9 +98,22 @@ def _unsure(labels: Sequence[str]) -> list[str]:
     if not labels:
         return []
     return [
-        f"Barely identified by these recordings: {_named(labels)}. The error bar is as large as the value, its bounds "
-        "or its prior, or other parameters compensate. The value that fits best with this physics step is kept. [W11]"
+        f"These recordings barely show {_named(labels)}: the error bar is as large as the value, its bounds or its "
+        f"prior. The best value is kept. To identify it, {_motions(labels)}. [W11]"
     ]
+
+
+def _with_unit(problem: Problem, label: str, value: float) -> str:
+    """A value as "0.01 kg m^2", the delay in ms."""
+    name, key = label.split("/", 1)
+    if name == "delay":
+        return f"{1e3 * problem.control_dt * value:.3g} ms"
+    return f"{value:.3g} {problem.space.unit_of(name, key)}".removesuffix(" 1")
+
+
+def _motions(labels: Iterable[str]) -> str:
+    """The motions that show parameters: "reverse slowly and often; send steps or a fast chirp"."""
+    return "; ".join(dict.fromkeys(_SHOWN_BY.get(label.split("/")[0], _OTHERWISE) for label in labels))
 
 
 def _named(labels: Sequence[str]) -> str:
@@ -157,15 +181,18 @@ def _overfit(rmse: dict[str, dict[str, float]], change: float, joint_types: Sequ
     ]
 
 
-def _sampled_commands(problem: Problem, rmse: dict[str, dict[str, float]], uncertainty: Uncertainty) -> list[str]:
+def _sampled_commands(
+    problem: Problem, physical: torch.Tensor, rmse: dict[str, dict[str, float]], uncertainty: Uncertainty
+) -> list[str]:
     """Whether the drives seem to have got commands more often than they were logged.
 
     What is logged with slow samples is then early by half of the time between two commands on average: no delay that
     is 0 or more makes up for it, and the motion has none of the steps that held commands make.
     """
     slowest = max(r.sample_stride if r.des_time is None else 1 for r in problem.dataset.recordings)
-    low = problem.space.lower[problem.space["delay"]]
-    at_bound = f"delay/{GLOBAL}" in uncertainty.at_bound and float(low) == 0
+    of_delay = problem.space["delay"]
+    low, high, delay = (float(each[of_delay]) for each in (problem.space.lower, problem.space.upper, physical))
+    at_bound = f"delay/{GLOBAL}" in uncertainty.at_bound and low == 0 and delay < high / 2
     if slowest == 1 or not at_bound or (times_noise(problem, rmse["train"].get(ALL)) or 0.0) < FAR_ABOVE_NOISE:
         return []
     return [

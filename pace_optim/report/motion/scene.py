@@ -7,6 +7,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from .meshes import Looks
+
 _SHAPES = {
     mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
     mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
@@ -24,12 +26,13 @@ _BONE = 0.03
 _BONE_COLOUR = (0.6, 0.6, 0.62, 1.0)
 
 
-def scene_of(model: mujoco.MjModel, looks: mujoco.MjModel | None = None) -> dict[str, Any]:
-    """What a robot looks like: its shapes, and bones from joint to joint of links that have none.
+def scene_of(model: mujoco.MjModel, looks: Looks | None = None) -> dict[str, Any]:
+    """What a robot looks like: its shapes, and bones from joint to joint of links that lack some.
 
     Args:
         model: The compiled model.
-        looks: A model whose bodies have the shapes of those of the same name; ``None``: the model's own.
+        looks: Shapes of bodies by their names; ``None``: the model's own alone. A body whose meshes could not be read
+            has its own shapes too, and a bone.
 
     Returns:
         ``bodies`` (name, parent, position [m] and quaternion in the parent; index 0 is the world), ``joints`` (body,
@@ -38,10 +41,13 @@ def scene_of(model: mujoco.MjModel, looks: mujoco.MjModel | None = None) -> dict
     """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
+    looks = looks or Looks()
     geoms = [_geom(source, g) | {"body": body} for source, g, body in _shown(model, looks)]
+    unread = {b for b in range(1, model.nbody) if model.body(b).name in looks.unread}
     shaped = {int(model.body_weldid[geom["body"]]) for geom in geoms}
     extent = np.ptp(data.xpos[1:], axis=0) if model.nbody > 1 else np.zeros(3)
-    geoms += _bones(model, [b for b in range(1, model.nbody) if int(model.body_weldid[b]) not in shaped], extent)
+    bare = [b for b in range(1, model.nbody) if b in unread or int(model.body_weldid[b]) not in shaped]
+    geoms += _bones(model, bare, extent)
     low, high = _box(geoms, data)
     return {
         "bodies": [
@@ -69,18 +75,18 @@ def scene_of(model: mujoco.MjModel, looks: mujoco.MjModel | None = None) -> dict
     }
 
 
-def _shown(model: mujoco.MjModel, looks: mujoco.MjModel | None) -> list[tuple[mujoco.MjModel, int, int]]:
+def _shown(model: mujoco.MjModel, looks: Looks) -> list[tuple[mujoco.MjModel, int, int]]:
     """Visible shapes: the model that has each, its index there, and its body in the first one."""
     found: list[tuple[mujoco.MjModel, int, int]] = []
     ids = {model.body(b).name: b for b in range(1, model.nbody)}
-    if looks is not None:
-        bodies = [looks.body(int(looks.geom_bodyid[g])).name for g in range(looks.ngeom)]
-        found = [(looks, g, ids[name]) for g, name in enumerate(bodies) if name in ids and _is_visible(looks, g)]
-    seen = {body for _, _, body in found}
-    own = [(model, g, int(model.geom_bodyid[g])) for g in range(model.ngeom)]
-    visible = [each for each in own if _is_visible(model, each[1])]
+    if (own := looks.model) is not None:
+        bodies = [own.body(int(own.geom_bodyid[g])).name for g in range(own.ngeom)]
+        found = [(own, g, ids[name]) for g, name in enumerate(bodies) if name in ids and _is_visible(own, g)]
+    seen = {body for _, _, body in found} - {ids[name] for name in looks.unread if name in ids}
+    every = [(model, g, int(model.geom_bodyid[g])) for g in range(model.ngeom)]
+    visible = [each for each in every if _is_visible(model, each[1])]
     if all(body == 0 for _, _, body in [*visible, *found]):  # a model without visual groups: take what collides
-        visible = [each for each in own if each[2] != 0 and int(model.geom_type[each[1]]) in map(int, _SHAPES)]
+        visible = [each for each in every if each[2] != 0 and int(model.geom_type[each[1]]) in map(int, _SHAPES)]
     return [*found, *(each for each in visible if each[2] not in seen)]
 
 

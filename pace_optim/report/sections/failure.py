@@ -12,7 +12,7 @@ from markupsafe import Markup
 from pace_actuators.joint_units import JointType, joint_label, units_for
 from pace_actuators.text import position_text, position_unit, short_duration, three_figures
 
-from ..markup import Section, bullets, choice, html, json_script, table
+from ..markup import Section, bullets, choice, html, json_script, log_step, table
 from ..run_data import RunData
 
 
@@ -104,6 +104,8 @@ def _by_joint(content: dict[str, Any]) -> Markup:
     return table(head, rows, "by-joint")
 
 
+_LETTERS = 40
+"""Of tick labels that a panel has room for."""
 _PANELS = ("velocity", "since_reversal", "position", "load", "acceleration", "time")
 _MEASURED, _MODEL, _NOISE = "var(--measured)", "var(--simulated)", "var(--muted)"
 
@@ -223,7 +225,7 @@ def _where(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str, An
         for share in ("error", "time"):
             traces.append({"x": at, "y": _numbers(panel[share], 100.0), "customdata": spans})
         inner = [b for b in range(len(edges)) if edges[b] is not None]
-        texts = [_tick(edges[b]) for b in inner]
+        texts = _apart([_tick(edges[b]) for b in inner], len(at))
         layout[f"xaxis{key}"] = {"tickvals": inner, "ticktext": texts, "range": [-0.05, len(at) + 0.05]}
         layout[f"xaxis{key}"] |= {
             "title": {"text": panel["title"] + f" [{unit}]" * bool(unit), "font": {"size": 12}, "standoff": 4}
@@ -235,7 +237,18 @@ def _where(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str, An
 
 
 def _tick(value: float) -> str:
-    return f"{value:g}".replace("-", "−")
+    return f"{value:.2g}".replace("-", "−")
+
+
+def _apart(texts: Sequence[str], bars: int) -> list[str]:
+    """Labels one bar apart, those left out that would overlap the one before."""
+    shown, free = [], -1.0
+    for place, text in enumerate(texts):
+        half = 0.5 * len(text) * bars / _LETTERS
+        fits = place - half > free
+        shown.append(text if fits else "")
+        free = place + half + bars / _LETTERS if fits else free
+    return shown
 
 
 def _span(edges: Sequence[float | None], b: int, unit: str) -> str:
@@ -260,7 +273,7 @@ def _spectrum(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str,
     return {
         "text": text + " Each point is a third of an octave.",
         "traces": [{"x": centre, "y": rms}, {"x": centre, "y": noise}],
-        "layout": {"yaxis": _title(f"error [{unit}]")},
+        "layout": {"xaxis": {"dtick": log_step(centre)}, "yaxis": _title(f"error [{unit}]")},
     }
 
 
@@ -284,7 +297,7 @@ def _response(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str,
         for key in ("magnitude_db", "phase_deg", "coherence")
         for of in ("measured", "model")
     ]
-    return {"text": text, "traces": traces, "layout": {}}
+    return {"text": text, "traces": traces, "layout": {"xaxis": {"dtick": log_step(frequency)}}}
 
 
 def _response_traces() -> list[dict[str, Any]]:
@@ -315,8 +328,8 @@ def _loops(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str, An
     factor_e, unit_e = position_unit([*content["error"]["up"], *content["error"]["down"]], types_of(joint))
     traces = []
     for of in ("measured", "model"):
-        loop = [*content[of]["up"], *reversed(content[of]["down"]), content[of]["up"][0]]
-        traces.append({"x": [*position, *reversed(position), position[0]], "y": _numbers(loop, factor)})
+        loop = [*content[of]["up"], None, *reversed(content[of]["down"])]  # strokes end where the joint turns, not both
+        traces.append({"x": [*position, None, *reversed(position)], "y": _numbers(loop, factor)})
     for way in ("up", "down"):
         traces.append({"x": position, "y": _numbers(content["error"][way], factor_e)})
     across = units_for("rad", types_of(joint))

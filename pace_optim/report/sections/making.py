@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import shlex
-from typing import Any
-
 from pace_actuators.text import count_in_short, duration
-from pace_optim.terminal.cli import command
+from pace_optim.run.settings import command_line
 
 from ..markup import Section, html
 from ..run_data import RunData
@@ -37,7 +34,7 @@ def making(run: RunData) -> Section:
         '<dl class="facts">{% for name, value in facts.items() %}<div><dt>{{ name }}</dt><dd>{{ value }}</dd></div>'
         "{% endfor %}</dl>{% if command %}<p>The same fit again:</p><pre>{{ command }}</pre>{% endif %}",
         facts=facts,
-        command=_command(run.settings),
+        command=command_line(run.settings) if "task" in run.settings else "",
     )
     return Section(id="making", title="How it was made", html=text)
 
@@ -46,25 +43,3 @@ _DELAY_MODES = {
     "command": "the targets are delayed, the feedback is not",
     "effort": "the whole torque is delayed, feedback included",
 }
-
-_WITHOUT_FLAG = ("start", "check_consistency")
-"""Settings that no flag of the same name makes."""
-
-
-def _command(settings: dict[str, Any]) -> str:
-    """The command line of these settings; what was left to the robot's configuration is left out."""
-    if "task" not in settings:
-        return ""
-    words = ["python", *command("fit").split()]
-    words = words if words[1].endswith(".py") else words[1:]
-    flags = {name: value for name, value in settings.items() if name not in _WITHOUT_FLAG}
-    flags["no_consistency"] = settings.get("check_consistency") is False
-    for name, value in flags.items():
-        if value is None or value is False or value == []:
-            continue
-        words.append(f"--{name}")
-        if isinstance(value, list):
-            words += [str(entry) for entry in value]
-        elif value is not True:
-            words.append(str(value))
-    return shlex.join(words)

@@ -16,7 +16,7 @@ from pace_optim.run.summary import ABOVE_NOISE, next_line
 
 from ..markup import Section, bullets, folded, html
 from ..run_data import RunData
-from .verdict import headline, verdict_first
+from .verdict import headline, is_before, verdict_first
 
 _STOPPED_EARLY = ("max_iteration", "interrupted")
 
@@ -26,18 +26,21 @@ def overview(run: RunData) -> Section:
     result = run.result
     head = html(
         '<p class="eyebrow">{{ robot }} · {{ task }} · {{ folder }}</p><h1>{{ headline }}</h1>'
-        '<p class="lead">{{ verdict }}</p>{% if next %}<p>Next: <code>{{ next }}</code></p>{% endif %}',
+        '{% if before %}{{ diagnosed }}<h3>This run is the fit without it</h3>{% endif %}<p class="lead">{{ verdict }}'
+        "</p>{% if not before %}{{ diagnosed }}{% endif %}{% if next %}<p>Next: <code>{{ next }}</code></p>{% endif %}",
         robot=result.robot_name,
         task=result.task,
         folder=run.folder.resolve().name,
         headline=headline(run) or _plain_headline(result),
         verdict=_verdict(run),
+        diagnosed=verdict_first(run),
+        before=is_before(run),
         next=_next(run),
     )
     return Section(
         id="overview",
         title="Overview",
-        html=head + verdict_first(run) + _figures(result) + _warnings(result) + _errors_by_joint(result),
+        html=head + _figures(result) + _warnings(result) + _errors_by_joint(result),
     )
 
 
@@ -49,17 +52,15 @@ def _plain_headline(result: FitResult) -> str:
         return f"{result.times_noise:,.0f} times the noise: physics is missing"
     errors = result.rmse.get("validation") or result.rmse["train"]
     times = result.times_noise * errors[ALL] / result.rmse["train"][ALL]
-    where = "on data it was not fitted to" if result.rmse.get("validation") else "on the data it was fitted to"
+    where = "on held-out data" if result.rmse.get("validation") else "on the training data"
     return f"{times:.2g} times the noise {where}" if times >= ABOVE_NOISE else f"At the noise {where}"
 
 
 def _follows(result: FitResult) -> str:
     error = result.rmse.get("validation", {}).get(ALL)
     if error is not None:
-        return f"The simulation follows the robot to {_of_all(result, error)} on data it was not fitted to"
-    return (
-        f"The simulation follows the robot to {_of_all(result, result.rmse['train'][ALL])} on the data it was fitted to"
-    )
+        return f"The held-out error is {_of_all(result, error)}"
+    return f"The training error is {_of_all(result, result.rmse['train'][ALL])}"
 
 
 def _of_all(result: FitResult, error: float | None) -> str:
@@ -70,12 +71,12 @@ def _verdict(run: RunData) -> str:
     train = run.result.rmse["train"].get(ALL)
     held_out = run.result.rmse.get("validation", {}).get(ALL)
     share = _share_of_motion(run, held_out is not None)
-    part = "" if share is None else f", {_percent(share)} of how far they move"
-    sentences = [f"{_follows(run.result)}: the root mean square over all joints{part}."]
+    part = "" if share is None else f", {_percent(share)} of the motion"
+    sentences = [f"{_follows(run.result)} (RMS of all joints){part}."]
     if held_out is None:
         sentences.append("Nothing was kept for validation, so this says little of other motions.")
     else:
-        sentences.append(f"On the data it was fitted to, it is {_of_all(run.result, train)}.")
+        sentences.append(f"The training error is {_of_all(run.result, train)}.")
     if len(run.result.joint_names) > 1:
         worst, where = _worst_joint(run.result)
         sentences.append(f"The worst joint is {worst} with {position_text(where, [run.result.joint_type(worst)])}.")
@@ -164,7 +165,10 @@ def _warnings(result: FitResult) -> Markup:
     said = bullets(sentences[:most])
     if rest := sentences[most:]:
         said += folded(len(rest), bullets(rest))
-    text = '<div class="callout bad"><h3>{{ title }}: read before you use the values</h3>{{ said }}</div>'
+    text = (
+        '<div class="callout bad"><h3>{{ title }}: read before you use the values '
+        "<small>(meaning and cure of each code: docs/faq.md)</small></h3>{{ said }}</div>"
+    )
     return html(text, title=title, said=said)
 
 

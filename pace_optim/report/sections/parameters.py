@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from markupsafe import Markup
 
@@ -29,7 +29,11 @@ def parameters(run: RunData) -> Section:
     """A table per parameter; those of the whole robot share one."""
     result = run.result
     shared = [name for name, values in result.parameters.items() if set(values) == {ALL}]
-    cards = [_card(run, name) for name in result.parameters if name not in shared]
+    cards = [
+        _card(run, name, unit)
+        for name, values in result.parameters.items()
+        for unit in (() if name in shared else dict.fromkeys(result.unit_of(name, key) for key in values))
+    ]
     if shared:
         step = 1e3 * result.control_dt  # of the delay, which is shown in ms
         units = {name: ("ms", step) if name == "delay" else (result.unit_of(name, ALL), 1.0) for name in shared}
@@ -58,28 +62,26 @@ def _article(title: str, unit: str, content: Markup) -> Markup:
     )
 
 
-def _card(run: RunData, name: str) -> Markup:
-    """One parameter of all joints: a table whose rows are also a plot."""
-    values, std = run.result.parameters[name], run.result.std.get(name, {})
+def _card(run: RunData, name: str, unit: str) -> Markup:
+    """One parameter of all joints with the same unit: a table whose rows are also a plot."""
+    values = {key: v for key, v in run.result.parameters[name].items() if run.result.unit_of(name, key) == unit}
+    std = run.result.std.get(name, {})
     ends = [v + side * _CONFIDENCE * (std.get(key) or 0.0) for key, v in values.items() for side in (-1, 1)]
-    low, high = _padded(min(ends), max(ends), run, name)
-    unit = " or ".join(pretty_unit(u) for u in dict.fromkeys(run.result.unit_of(name, key) for key in values))
-    mixed = " or " in unit
-    titles = {key: f"{key} [{pretty_unit(run.result.unit_of(name, key))}]" if mixed else key for key in values}
-    for key, file in run.result.file_values.get(name, {}).items():
-        titles[key] += f" (file {file:.4g})"
+    own = [run.bounds[f"{name}/{key}"] for key in values if f"{name}/{key}" in run.bounds]
+    low, high = _padded(min(ends), max(ends), own)
+    files = run.result.file_values.get(name, {})
+    titles = {key: f"{key} (file {files[key]:.4g})" if key in files else key for key in values}
     rows = [_row(run, name, key, titles[key], "", (low, high)) for key in values]
     rows.append(["", "", "", _axis(low, high), "", ""])
     what = "link" if name in run.result.link_parameters else "joint"
     head = [what, "value", "± std", "value and 95 % interval", "between its bounds", ""]
-    return _article(in_words(name), unit, table(head, rows, "values"))
+    return _article(in_words(name), pretty_unit(unit), table(head, rows, "values"))
 
 
-def _padded(low: float, high: float, run: RunData, name: str) -> tuple[float, float]:
+def _padded(low: float, high: float, bounds: Sequence[tuple[float, float]]) -> tuple[float, float]:
     """The plot's range; intervals much wider than the bounds are cut, and a single value gets some room."""
-    own = [bound for label, bound in run.bounds.items() if label.split("/")[0] == name]
-    if own:
-        lower, upper = min(b[0] for b in own), max(b[1] for b in own)
+    if bounds:
+        lower, upper = min(b[0] for b in bounds), max(b[1] for b in bounds)
         low, high = max(low, lower - (upper - lower) / 4), min(high, upper + (upper - lower) / 4)
     room = 0.06 * (high - low) or 0.1 * abs(high) or 1.0
     if high - low < 1e-3 * abs(high):  # all alike to many digits: do not blow up nothing

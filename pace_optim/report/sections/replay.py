@@ -10,13 +10,17 @@ import mujoco
 import numpy as np
 from markupsafe import Markup
 
+from pace_actuators.text import listed
+
 from ..markup import Section, choice, html, json_script
-from ..motion import Motion, looks_of, motions_of, scene_of
+from ..motion import Looks, Motion, looks_of, motions_of, scene_of
 from ..motion.scene import scalar_joints
 from ..run_data import RunData
 
 _RECORDINGS_ON_PAGE = 8
 """Those with the largest errors; each takes some 8 bytes a joint and picture."""
+_MESHES = 3
+"""Meshes and links that the note names."""
 _SPEEDS = (("real time", 1.0), ("1/4", 0.25), ("1/10", 0.1), ("1/50", 0.02))
 _EXAGGERATIONS = (1, 5, 20, 100)
 _OF_BASE = (
@@ -34,16 +38,17 @@ def replay(run: RunData) -> Section | None:
     motions = motions_of(
         model, run.joint_names, run.worst_first()[:_RECORDINGS_ON_PAGE], [bias[name] for name in run.joint_names]
     )
+    looks = None if run.model_file is None else looks_of(run.model_file)
     return Section(
         id="replay",
         title="Replay",
         lead="Blue: measured. Solid: simulated, coloured by its error. Drag to turn, wheel to come closer."
         + (_OF_BASE if any(motion.base is not None for motion in motions) else ""),
-        html=viewer(model, motions, None if run.model_file is None else looks_of(run.model_file)),
+        html=viewer(model, motions, looks) + _about(looks),
     )
 
 
-def viewer(model: mujoco.MjModel, motions: Sequence[Motion], looks: mujoco.MjModel | None = None) -> Markup:
+def viewer(model: mujoco.MjModel, motions: Sequence[Motion], looks: Looks | None = None) -> Markup:
     """HTML of a viewer that the page's script brings to life."""
     content = {
         "scene": scene_of(model, looks),
@@ -64,6 +69,19 @@ def viewer(model: mujoco.MjModel, motions: Sequence[Motion], looks: mujoco.MjMod
         speeds=_SPEEDS,
         times=_EXAGGERATIONS,
         script=json_script(content),
+    )
+
+
+def _about(looks: Looks | None) -> Markup:
+    """Which links are drawn as rods, and for which meshes."""
+    if looks is None or not looks.unread:
+        return Markup("")
+    meshes = list(dict.fromkeys(mesh for own in looks.unread.values() for mesh in own))
+    return html(
+        '<p class="replay-note">Plain rods stand for meshes that are missing, or neither STL, OBJ nor MSH: '
+        "{{ meshes }} ({{ links }}).</p>",
+        meshes=listed(meshes, _MESHES),
+        links=listed(list(looks.unread), _MESHES),
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pace_actuators.joint_units import units_for
 
-from ..markup import Section, figure
+from ..markup import Section, figure, log_step
 from ..run_data import RunData
 
 _SQUARED = "the squared error, summed over the joints"
@@ -53,7 +53,12 @@ def scores(run: RunData) -> Section | None:
     ]
     layout = {
         "xaxis": {"title": {"text": axes["Iterations"][2]}},
-        "yaxis": {"type": "log", "tickformat": ".0e", "title": {"text": "objective" if own else f"score [{unit}]"}},
+        "yaxis": {
+            "type": "log",
+            "tickformat": ".0e",
+            "dtick": log_step(value for _, values, *_ in curves for value in values),
+            "title": {"text": "objective" if own else f"score [{unit}]"},
+        },
         "hovermode": "x unified",
     }
     return Section(

@@ -53,6 +53,15 @@ def headline(run: RunData) -> str:
         return _heading(run, content)[1] if content else ""
 
 
+def is_before(run: RunData) -> bool:
+    """Whether another run has what was found to be missing in this one: then that run's error says more."""
+    with run.blaming("diagnosis.json"):
+        content = run.read_json("diagnosis.json")
+        if not content:
+            return False
+        return not _has_it(run.result, content) and _other_run(run, content) is not None
+
+
 def _heading(run: RunData, content: dict[str, Any]) -> tuple[str, str]:
     """Class and words of a diagnosis' heading. It is good where nothing is missing beside what was found."""
     fit, has_it = run.result, _has_it(run.result, content)
@@ -118,8 +127,9 @@ def _callout(run: RunData, content: dict[str, Any], more: Markup) -> Markup:
         '<div class="callout {{ css }}"><p>{{ summary }}</p>'
         "{% if has_it %}<p>This run is the fit with it.</p>{% elif (effects or links) and not other %}<p>{{ why }}: "
         "<code>{{ command }} …{% if effects %} --effects {{ effects }}{% endif %}{% if links %} --links {{ links }}"
-        '{% endif %}</code></p>{% endif %}{% if other %}<p>{{ "The run without it" if has_it else "The run with it" }}:'
-        ' <b><a href="{{ other }}/report.html">{{ other.name }}</a></b></p>{% endif %}{{ more }}</div>',
+        '{% endif %}</code></p>{% endif %}{% if other %}<p class="other">'
+        'The run {{ "without" if has_it else "with" }} it: <b>'
+        '<a href="{{ other }}/report.html">{{ other.name }}</a></b></p>{% endif %}{{ more }}</div>',
         css=_heading(run, content)[0],
         summary=content["summary"],
         has_it=_has_it(run.result, content),

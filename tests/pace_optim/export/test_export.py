@@ -79,6 +79,16 @@ def test_an_export_of_a_fit_that_is_not_to_be_trusted_says_so(result):
     assert "171 times the measurement noise" in notes and f"friction/{JOINTS[0]} ended at a bound" in notes
 
 
+def test_an_export_of_a_fit_with_a_short_step_names_the_step_to_train_at(result):
+    """A diagnosis ended at 0.125 ms: 40 of its steps make one of Isaac Lab's."""
+    assert not any("slow in training" in note for note in export(result, "isaaclab").notes)
+    content = json.loads(result.read_text()) | {"physics_dt": 0.000125}
+    result.write_text(json.dumps(content))
+    assert any(
+        "0.125 ms is slow" in note and "--physics_dt 0.0025" in note for note in export(result, "isaaclab").notes
+    )
+
+
 def test_the_mjcf_says_what_it_cannot_hold(result):
     exported = export(result, "mjcf", joints_only=True)
     said = " ".join(exported.notes)

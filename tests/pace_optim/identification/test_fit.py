@@ -14,6 +14,7 @@ from problems import BENCH, TRUTH, chirp, record
 
 import pace_optim.identification.fit as fit_module
 from pace_envs import load_env_cfg
+from pace_optim.estimate.least_squares import Descent
 from pace_optim.estimate.way_down import WayDown
 from pace_optim.identification import conclude
 from pace_optim.identification.fit import fit, resume
@@ -403,21 +404,37 @@ def test_the_progress_names_what_runs_and_its_speed_and_is_never_silent(monkeypa
     now[0] = 100.0
     line.say("something before")
     now[0] = 120.0
-    line.show("refine", done=2, total=10, best=1e-6, spread=None, steps=2_000_000)
-    assert "refine: 2/10 at most  best 1.000e-06  100k steps/s  120 s" in out.getvalue()
+    line.show("refine", done=2, total=10, error="error 1 mrad", spread=None, steps=2_000_000)
+    assert "refine: 2/10 at most  error 1 mrad  100k steps/s  120 s" in out.getvalue()
     line.close()
     line.restart()
     assert line.elapsed == 0.0
+    now[0] = 130.0
+    line.say("the next fit")  # its clock begins anew; what is shown is the time of the command
+    assert out.getvalue().endswith("\nthe next fit  130 s")
+
+
+def test_the_progress_of_a_start_is_its_own(tmp_path):
+    settings = FitSettings(task=BENCH, data=[str(save_recording(tmp_path / "r.npz", record()))], log_dir=str(tmp_path))
+    problem, out = load_for_fit(settings, load_env_cfg(settings.task)), io.StringIO()
+    run = Optimization(settings, problem, RunFolder(tmp_path), ProgressLine(out))
+    x, stage = problem.space.start, "pieces"
+    first = Descent(x=x, stage=stage, scores=[1e-8], iteration=4, stop_reason="converged")
+    run._after_iteration([first, Descent(x=x, stage=stage)])
+    run._after_iteration([first, Descent(x=x, stage=stage, scores=[1e-6], iteration=1)])
+    run.progress.close()
+    assert "fit on pieces: 4/15 at most  error 0.1 mrad" in out.getvalue()
+    assert "fit on pieces from start 2: 1/15 at most  error 1 mrad" in out.getvalue()
 
 
 def test_a_step_that_takes_long_is_named_again():
     out = io.StringIO()
-    line = ProgressLine(out, seconds_between_lines=0.1)
+    line = ProgressLine(out, seconds_between_times=0.1)
     line.wait_for("reading")
     assert out.getvalue() == ""
     time.sleep(0.35)
     line.close()
-    assert out.getvalue().startswith("reading  0 s\n")
+    assert out.getvalue().startswith("reading  0 s")
 
 
 def test_a_fit_that_took_long_tells_its_result_before_it_is_checked(tmp_path, monkeypatch):

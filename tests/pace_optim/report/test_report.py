@@ -1,6 +1,7 @@
 """The report says what a run found, holds everything it needs, and draws in a browser."""
 
 import time
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -12,8 +13,10 @@ from run_folders import JOINTS, LABELS, make_result, make_trajectory, write_run
 from pace_actuators.files import write_json, write_tensors
 from pace_actuators.text import duration, value_and_error
 from pace_optim.report import write_report
+from pace_optim.report.markup import log_step
 from pace_optim.report.sections import SECTIONS
 from pace_optim.report.sections.correlation import strong_pairs
+from pace_optim.report.sections.failure import _apart
 from pace_optim.report.sections.parameters import _beside, nice_ticks
 from pace_optim.report.sections.trajectories import samples_to_draw
 
@@ -33,8 +36,8 @@ def test_it_names_every_joint_parameter_and_error(page):
         assert joint in page.text
     for words in ("Armature", "Viscous friction", "Friction", "Encoder bias", "Delay", "kg m²"):
         assert words in page.text
-    assert "follows the robot to 4.3 mrad on data it was not fitted to" in page.text
-    assert "On the data it was fitted to, it is 3.1 mrad." in page.text
+    assert "The held-out error is 4.3 mrad (RMS of all joints)" in page.text
+    assert "The training error is 3.1 mrad." in page.text
     assert "The worst joint is ankle with 6.1 mrad." in page.text
     assert "12.50 0.25 ms 0 25" in page.text and "5 control steps of 2.5 ms" in page.text  # the delay
     assert "at its upper bound" in page.text and "cannot be separated from encoder bias" in page.text
@@ -100,7 +103,7 @@ def test_without_validation_it_says_how_little_that_says(tmp_path):
         recording["train"] = torch.ones_like(recording["train"])
     write_tensors(folder / "best_trajectory.pt", content)
     text = page_of(folder).text
-    assert "follows the robot to 3.1 mrad on the data it was fitted to" in text
+    assert "The training error is 3.1 mrad (RMS of all joints)" in text
     assert "Nothing was kept for validation" in text
 
 
@@ -194,6 +197,15 @@ def test_strong_pairs_are_found_once_and_strongest_first():
 def test_ticks_are_round_and_inside(low, high):
     ticks = nice_ticks(low, high)
     assert 2 <= len(ticks) <= 6 and low - 1e-12 <= ticks[0] and ticks[-1] <= high + 1e-12
+
+
+def test_ticks_of_a_figure_are_more_than_one_and_do_not_overlap():
+    assert log_step([0.3, 1.0, 3.0]) == "D2" and log_step([0.1, 90.0]) == 1
+    edges = ["−0.05", "−0.031", "−0.012", "−0.0038", "0.0038", "0.012", "0.031", "0.05"]
+    shown = [(i, text) for i, text in enumerate(_apart(edges, 9)) if text]
+    assert len(shown) >= 4
+    for (i, one), (j, other) in pairwise(shown):
+        assert (j - i) * 40 / 9 > 0.5 * (len(one) + len(other))
 
 
 def test_durations_read_well():

@@ -50,6 +50,9 @@ def test_the_run_with_what_was_missing_is_not_told_to_add_it(tmp_path):
     # the report of a diagnosed run names the run beside it
     text = page_of(folder_with(tmp_path / "without", make_diagnosis())).text
     assert "Missing in this run: Stribeck friction" in text and "The run with it: with" in text
+    assert (
+        text.index("The run with it") < text.index("This run is the fit without it") < text.index("The held-out error")
+    )
     assert "Add it" not in text
 
 

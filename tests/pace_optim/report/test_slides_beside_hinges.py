@@ -102,6 +102,7 @@ def test_the_comparison_tells_each_in_its_unit(fitted):
         assert not re.search(theirs, json.dumps({key: joints[joint][key] for key in ("sentence", "places")}))
     page = report_text(run).decode()
     assert "<b>axis [mm]</b>" in page and "<b>swing [mrad]</b>" in page
+    assert "Armature <small>kg</small>" in page and "Armature <small>kg m²</small>" in page  # an axis for each
     assert '"position_unit":"m"' in page and '"position_unit":"rad"' in page
     assert "position [m]" in page and "position [rad]" in page and "load force [N]" in page
 

@@ -4,27 +4,53 @@ import importlib
 import io
 import sys
 import time
+import warnings
 
 import pytest
 
+from pace_optim.terminal.cli import run_cli
 from pace_optim.terminal.progress import ProgressLine
 
 BETWEEN = 0.15
-"""Seconds between lines here; ten elsewhere."""
+"""Seconds between times here; ten elsewhere."""
 
 
-def test_off_a_terminal_a_step_is_printed_at_once_and_then_from_time_to_time():
+def test_off_a_terminal_a_step_has_a_line_at_once_and_then_times():
     stream = io.StringIO()
     progress = ProgressLine(stream, BETWEEN)
     progress.say("fitting")
-    assert stream.getvalue() == "fitting  0 s\n"
-    time.sleep(3.5 * BETWEEN)
+    assert stream.getvalue() == "fitting  0 s"
+    time.sleep(4.5 * BETWEEN)
     for done in range(1000):  # a counter is no reason for a line each
-        progress.show("search", done, 2000, 1.0, None, 10)
+        progress.show("search", done, 2000, "error 1 mrad", None, 10)
     progress.close()
     lines = stream.getvalue().splitlines()
-    assert 3 <= sum(line.startswith("fitting") for line in lines) <= 4
+    fitting = [line for line in lines if line.startswith("fitting")]
+    assert 4 <= sum(line.count(" s") for line in fitting) <= 5
+    assert len(fitting) == 2  # every third time anew
     assert sum(line.startswith("search: ") for line in lines) <= 2
+
+
+def test_a_line_of_a_file_is_ended_before_another_step_or_a_message():
+    stream = io.StringIO()
+    progress = ProgressLine(stream, 60.0)
+    progress.say("fitting")
+    progress.say("fitting")
+    progress.say("checking")
+    progress.tell("note: done")
+    progress.say("writing")
+    progress.close()
+    assert stream.getvalue() == "fitting  0 s  0 s\nchecking  0 s\nnote: done\nwriting  0 s\n"
+
+
+def test_an_error_begins_a_line_of_its_own(capsys):
+    def main():
+        ProgressLine(sys.stderr, 60.0).say("reading")
+        sys.stderr.write(warnings.formatwarning("soon", UserWarning, "this.py", 1))  # as pytest catches them
+        raise ValueError("It is gone.")
+
+    assert run_cli(main) == 2
+    assert capsys.readouterr().err == "reading  0 s\nwarning: soon\nerror: It is gone.\n"
 
 
 class DoneError(Exception):

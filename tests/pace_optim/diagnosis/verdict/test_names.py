@@ -18,8 +18,8 @@ from pace_optim.diagnosis.checks.stated_facts import excluded_effects
 from pace_optim.diagnosis.findings import findings
 from pace_optim.diagnosis.findings.findings import Findings, summary_of
 from pace_optim.diagnosis.search.state import Outcome
-from pace_optim.diagnosis.selection.naming import doubts
-from pace_optim.diagnosis.selection.size_consistency import unevenness
+from pace_optim.diagnosis.selection.naming import DIFFERS, doubts
+from pace_optim.diagnosis.selection.size_consistency import sizes_apart, unevenness
 from pace_optim.diagnosis.verdict import names as names_module
 from pace_optim.diagnosis.verdict.names import Hint, earned_names, shares_of
 from pace_optim.diagnosis.verdict.sizes import error_bars_from_none
@@ -195,6 +195,18 @@ def test_an_effect_whose_size_differs_between_recordings_is_seen(run):
         unevenness(replace(fitted_to(run.problem, 1.0), jacobian=None))
 
 
+def test_the_sizes_of_single_recordings_are_those_that_each_shows(run):
+    moves = torch.tensor([-0.02, 0.01, 0.01, 0.04])  # normalised: what each recording has beyond the mean
+    now = fitted_to(run.problem, *(-moves).tolist(), noise=1e-3)
+    apart, columns = sizes_apart(now, SPRING, 0), now.model.columns(SPRING)
+    own = (moves - moves.mean()).double()
+    x = now.x.repeat(4, 1, 1)
+    x[:, 0, columns.start] += own
+    expected = torch.stack([now.model.to_physical(each)[0, columns.start] for each in x])
+    assert torch.allclose(apart[:, 0], expected, atol=0.02)
+    assert torch.allclose(apart[:, 1], now.physical[0, columns.start + 1], atol=0.02)
+
+
 def test_halves_stand_for_recordings_where_there_are_one_or_two(run):
     assert float(unevenness(fitted_to(run.problem, 1.0, 2.0))[0]) > 0.5
     one = fitted_to(run.problem, 1.0)
@@ -304,7 +316,18 @@ def test_what_is_unknown_is_told_with_what_comes_nearest(bench):
     hint = Hint(effect="parallel_spring", joint=0, explained=0.75, doubts=["it is at a bound", "no drive has it"])
     said = summary_of(told_of(outcome, "unknown", {SPRING: 1.0}, [hint]), bench.problem)
     assert said.startswith("Something is missing, and no known effect has earned its name: the validation error is 10 ")
-    assert said.endswith("Nearest to it on servo is parallel_spring, but it is at a bound and no drive has it.")
+    assert said.endswith("Hint on servo: parallel_spring. It is not named, as it is at a bound and no drive has it.")
+
+
+def test_a_hint_has_its_size_and_how_far_that_goes_apart(bench):
+    size = {"parameter": "stiffness", "value": 2.0, "std": 0.1, "unit": "N m/rad", "factor": None, "at_bound": False}
+    far = [size | {"apart": [1.5, 2.5]}]
+    hint = Hint(effect="parallel_spring", joint=0, explained=0.75, doubts=[DIFFERS], sizes=far)
+    found = told_of(ended(bench, 5e-3, (SPRING, [True], [2.0, 0.1])), "unknown", {SPRING: 1.0}, [hint])
+    assert summary_of(found, bench.problem).endswith(
+        "Hint on servo: parallel_spring (stiffness 2 ± 0.1 N m/rad). It is not named, as its size differs between "
+        "recordings (stiffness 1.5 to 2.5 N m/rad)."
+    )
 
 
 @pytest.mark.parametrize("stopped", ["converged", "interrupted"])
@@ -343,6 +366,8 @@ def test_it_is_fitted_to_the_whole_robot_all_the_same(run, bench, monkeypatch, s
     assert Diagnosis.load(refit).verdict == "unknown"
     assert diagnosis.verdict == "unknown" and diagnosis.added == [] and diagnosis.paying == ["parallel_spring"]
     assert diagnosis.hints[0]["joint"] == "servo" and "75 %" in diagnosis.summary
+    assert diagnosis.advice[0].startswith("To try the hints on the whole robot: ")
+    assert diagnosis.advice[0].find(" --effects parallel_spring@servo ") > diagnosis.advice[0].find("fit.py --task") > 0
     assert Diagnosis.load(run.folder) == diagnosis
     page = write_report(run.folder).read_text("utf-8")
     advice = "this lowers the error: <code>scripts/fit.py … --effects parallel_spring</code>"

@@ -132,7 +132,8 @@ def test_verdict_errors_and_sizes_are_those_of_the_whole_robot_s_fit(tmp_path):
     assert far.sizes[0]["std"] is None and "Something else is missing on servo too" in far.summary
     lost = told_again(found, fit_of(9e-3, 0.25, 0.01), sizes, tmp_path)
     assert lost.verdict == "unknown" and lost.added == [] and lost.joints["servo"]["effects"] == ["quadratic_friction"]
-    assert "Nearest to it on servo is quadratic_friction, but it explains 19 %" in lost.summary
+    assert "Hint on servo: quadratic_friction (coefficient 0.25 ± 0.01 N m s^2/rad^2). It is not named" in lost.summary
+    assert "as it explains 19 %" in lost.summary
     assert not any(entry["added"] for entry in lost.ranking)
 
 

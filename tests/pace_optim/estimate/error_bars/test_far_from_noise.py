@@ -48,6 +48,7 @@ def test_the_end_is_told_as_a_multiple_of_the_noise_with_what_to_do():
     (told,) = far_end(370.0, 37e-3, "least_squares")
     assert "370 times the measurement noise" in told
     assert "--optimizer hybrid" in told and "diagnose.py looks" in told and "error bars mean nothing" in told
+    assert "First check gains, torque limits and loads." in told
     assert far_end(2.0, 1e-4, "least_squares") == far_end(None, 1e-4, "hybrid") == []
 
 
@@ -132,8 +133,8 @@ def test_warnings_are_one_for_each_kind_and_what_does_not_carry_over_comes_first
     )
     told = fit_warnings(problem, physical(problem, TRUTH), found, rmse, ["delay/all"], ["friction/servo"])
     assert "59.0 times" in told[0] and told[1].startswith("At a bound: friction (")
-    assert told[2].startswith("Not identified by these recordings: delay.")
-    assert told[3].startswith("Barely identified by these recordings: friction of servo.")
+    assert told[2].startswith("These recordings do not show delay (kept at ")
+    assert told[3].startswith("These recordings barely show friction of servo:")
     assert sum("cannot separate" in text for text in told) == 1
 
 

@@ -158,6 +158,9 @@ def test_commands_count_as_logged_too_rarely_where_a_delay_of_none_is_too_late(o
     told = fit_warnings(problem, at, known(problem, at_bound=("delay/all", *others)), far)
     assert any("logged with the samples, every 20 ms" in each for each in told)
     assert any("At a bound: " in each for each in told)
+    late = physical(problem, {**TRUTH, "delay": 10.0})  # the other bound: the commands are early enough
+    told = fit_warnings(problem, late, known(problem, at_bound=("delay/all", *others)), far)
+    assert not any("logged with the samples" in each for each in told)
 
 
 def test_a_fit_whose_truth_is_beyond_a_bound_is_told():
@@ -176,7 +179,8 @@ def test_parameters_without_influence_and_inseparable_ones_are_named():
     )
     told = fit_warnings(problem, physical(problem), uncertainty, FINE, ["delay/all"])
     assert len(told) == 2
-    assert "Not identified by these recordings: delay." in told[0]
+    assert told[0].startswith("These recordings do not show delay (kept at ") and " ms)" in told[0]
+    assert "To identify it, send steps or a fast chirp." in told[0]
     assert "cannot separate encoder bias and friction of servo" in told[1]
 
 

@@ -235,6 +235,37 @@ def test_a_urdf_s_meshes_are_drawn_though_the_dynamics_leave_them_out(tmp_path):
     assert shapes["hand"]["shape"] == "capsule"
 
 
+def test_a_link_with_a_mesh_that_cannot_be_read_is_not_in_two_pieces(tmp_path):
+    vertices, faces = ball(12)
+    rows = [f"v {x} {y} {z}" for x, y, z in vertices] + [f"f {a} {b} {c}" for a, b, c in faces + 1]
+    for name in ("ball.obj", "rod.obj"):  # up is y in rod.glb, so this is not the same
+        (tmp_path / name).write_text("\n".join(rows))
+    mass = '<inertial><mass value="1"/><inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    mesh = '<visual><geometry><mesh filename="{}"/></geometry></visual>'
+    (tmp_path / "bot.urdf").write_text(
+        f'<robot name="bot"><link name="world"/><link name="arm">{mass}{mesh.format("ball.obj")}'
+        f'{mesh.format("package://bot/rod.glb")}</link><joint name="shoulder" type="continuous"><parent link="world"/>'
+        '<child link="arm"/><axis xyz="0 1 0"/></joint></robot>'
+    )
+    looks = looks_of(tmp_path / "bot.urdf")
+    scene = scene_of(read_model_file(tmp_path / "bot.urdf").spec.compile(), looks)
+    assert looks.unread == {"arm": ["rod.glb"]}
+    assert {geom["shape"] for geom in scene["geoms"]} == {"mesh", "capsule"}
+
+
+def test_a_missing_mesh_of_a_model_file_leaves_the_others(tmp_path):
+    vertices, faces = ball(12)
+    rows = [f"v {x} {y} {z}" for x, y, z in vertices] + [f"f {a} {b} {c}" for a, b, c in faces + 1]
+    (tmp_path / "ball.obj").write_text("\n".join(rows))
+    (tmp_path / "bot.xml").write_text(
+        '<mujoco><asset><mesh file="ball.obj"/><mesh name="rod" file="rod.stl"/></asset><worldbody>'
+        '<body name="arm"><joint/><geom type="mesh" mesh="ball"/></body>'
+        '<body name="hand"><joint/><geom type="mesh" mesh="rod"/></body></worldbody></mujoco>'
+    )
+    looks = looks_of(tmp_path / "bot.xml")
+    assert looks.unread == {"hand": ["rod.stl"]} and looks.model.ngeom == 1
+
+
 def test_a_run_without_a_model_has_no_replay(tmp_path):
     folder = write_run(tmp_path / "leg" / "26_01_01_00-00-00")
     assert 'class="replay"' not in write_report(folder).read_text("utf-8")
