@@ -199,11 +199,7 @@ class IdentifiedDrives:
         return fields | self._rate_of(joints)
 
     def _rate_of(self, joints: Sequence[str]) -> dict[str, Any]:
-        """How the controllers of some joints ran: the same torque law needs the same rate.
-
-        Raises:
-            ValueError: If they ran differently.
-        """
+        """How the controllers of some joints ran: the same torque law needs the same rate."""
         names = ("drive_dt", *RATE_FLAGS)
         rates = {tuple(self.drive.get(name, {}).get(joint) for name in names) for joint in joints}
         if len(rates) > 1:
@@ -245,11 +241,7 @@ def delay_in_steps(cfg: PaceDCMotorCfg, physics_dt: float | None) -> tuple[float
     """Delay and largest delay of a drive [control steps].
 
     Args:
-        cfg: The drive.
         physics_dt: Time between two of its calls [s].
-
-    Raises:
-        ValueError: If the delay is given in seconds, and the time of a step is not known.
     """
     if cfg.delay_s is None:
         return (cfg.max_delay or 0.0) if cfg.delay is None else cfg.delay, cfg.largest_delay
@@ -266,7 +258,6 @@ def step_notes(cfg: PaceDCMotorCfg, physics_dt: float | None) -> list[str]:
     """What the time steps of a drive change about values that were identified with others, in words.
 
     Args:
-        cfg: The drive.
         physics_dt: Time between two of its calls [s]; ``None`` says nothing.
     """
     if cfg.identified is None or physics_dt is None:

@@ -34,16 +34,12 @@ def draw(drives: IdentifiedDrives, uniform: torch.Tensor, scale: float = 1.0) ->
     armature, frictions and delay stay >= 0, an effect's parameters within their bounds.
 
     Args:
-        drives: The identified drives.
         uniform: Independent draws between 0 and 1, (n, ``len(labels_with_std(drives))``).
         scale: Multiplies the standard deviations.
 
     Returns:
         {parameter: {joint or "all": (n,)}} of those that vary, in the units of the result (the delay in control steps
         of the identification).
-
-    Raises:
-        ValueError: If the scale is negative or not finite, or the number of draws is wrong.
     """
     labels = labels_with_std(drives)
     if not (math.isfinite(scale) and scale >= 0):

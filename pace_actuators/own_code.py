@@ -67,11 +67,7 @@ def _is_at(module: ModuleType, own: os.stat_result) -> bool:
 
 
 def import_named(module: str) -> ModuleType:
-    """Import a module that the user names, as ``package.module`` or as a file; it may lie in the present folder.
-
-    Raises:
-        ValueError: If it cannot be imported.
-    """
+    """Import a module that the user names, as ``package.module`` or as a file; it may lie in the present folder."""
     recorded = [finder for finder in sys.meta_path if isinstance(finder, _RecordedCode)]
     for finder in recorded:  # what the user names comes before what records name
         sys.meta_path.remove(finder)
@@ -93,12 +89,8 @@ def import_recorded(module: str, code: CodeRecord, where: str, hint: str) -> Mod
 
     Args:
         module: Its name or its file.
-        code: The record.
         where: The file that names it, for messages.
         hint: What the user types to name it himself.
-
-    Raises:
-        ValueError: If the record does not hold it, or the code has changed or gone.
     """
     name = next((n for n, entry in code.items() if entry["file"] == module), module)
     known = loaded_module(module)

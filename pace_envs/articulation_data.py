@@ -57,11 +57,7 @@ class ArticulationData:
 
 
 def of_floating_base(state: torch.Tensor | None) -> torch.Tensor:
-    """A part of the root's state.
-
-    Raises:
-        ValueError: If the base is fixed.
-    """
+    """A part of the root's state."""
     if state is None:
         raise ValueError("This robot's base is fixed: it has no root state. Set fix_base=False.")
     return state

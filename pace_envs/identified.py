@@ -126,11 +126,7 @@ def doubts_of_fit(drives: IdentifiedDrives) -> list[str]:
 
 
 def load_identified_cfg(drives: IdentifiedDrives) -> Any:
-    """The configuration of the environment in which drives were identified, from the record in their result.
-
-    Raises:
-        ValueError: If it is not known, and its code has changed or gone.
-    """
+    """The configuration of the environment in which drives were identified, from the record in their result."""
     try:
         record = EnvironmentRecord.read(drives.environment, drives.task)
     except TypeError as error:
@@ -144,9 +140,6 @@ def set_step(cfg: ManagerBasedEnvCfg, dt: float) -> None:
     Args:
         cfg: The environment; it is changed.
         dt: Time step [s].
-
-    Raises:
-        ValueError: If the time of an environment step is no multiple of it.
     """
     step_dt = cfg.sim.dt * cfg.decimation
     decimation = round(step_dt / dt) if dt > 0 else 0

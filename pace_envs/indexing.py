@@ -41,9 +41,6 @@ def checked_values(value: Any, shape: tuple[int, int], what: str) -> torch.Tenso
         value: What the user gives.
         shape: Number of environments and of joints.
         what: Its name, for messages.
-
-    Raises:
-        ValueError: If it is no number and no tensor, or its shape is another.
     """
     if isinstance(value, bool | int | float):
         return value

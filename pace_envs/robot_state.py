@@ -52,13 +52,8 @@ class JointLayout:
         """Find the joints in a model.
 
         Args:
-            model: The model.
             joint_order: Their order, and motors that move several joints; ``None`` means the model's joints.
             path: The model's file, for messages.
-            device: Device of the columns.
-
-        Raises:
-            ValueError: If the model has no joints to drive, or the order names unknown ones.
         """
         root, single = None, {}
         for j in range(model.njnt):
@@ -124,11 +119,7 @@ class RobotState:
         """Find the robot's joints in the simulation.
 
         Args:
-            cfg: The configuration.
             sim: The simulation that holds the robot.
-
-        Raises:
-            ValueError: If names in the configuration do not fit the model.
         """
         self.cfg = cfg
         self._sim = sim
@@ -228,9 +219,6 @@ class RobotState:
 
         Returns:
             Position [m] and quaternion (w, x, y, z), (num_envs, 7).
-
-        Raises:
-            ValueError: If the model has neither.
         """
         sim, model = self._sim, self._sim.model
         sites = [model.site(i).name for i in range(model.nsite)]
@@ -268,9 +256,6 @@ class RobotState:
 
         Returns:
             Indices and names.
-
-        Raises:
-            ValueError: If an expression matches no joint.
         """
         return find_names(name_keys, self.joint_names, preserve_order, "joint")
 
@@ -335,9 +320,6 @@ class RobotState:
             root_state: Position [m], quaternion (w x y z), linear velocity in the world [m/s] and angular
                 velocity in the base's frame [rad/s].
             env_ids: The environments, or ``None`` for all.
-
-        Raises:
-            ValueError: If the base is fixed.
         """
         if self._layout.root is None:
             raise ValueError("This robot's base is fixed: it has no root state to write.")

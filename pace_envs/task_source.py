@@ -31,9 +31,6 @@ def use_task(text: str) -> str:
     Args:
         text: A registered name, ``module:Name``, ``path/to/file.py:Name`` (either registers the name when it is
             imported), or a model file (``.xml``, ``.mjcf``, ``.urdf``).
-
-    Raises:
-        ValueError: If there is no such module or file.
     """
     if is_model_file(text):
         if not Path(text).is_file():
@@ -83,7 +80,6 @@ class EnvironmentRecord:
 
         Args:
             task: As :func:`use_task` returns it.
-            cfg: Its configuration.
             effects: Modules of effects of the user's own.
             folder: Where relative paths begin; ``None`` means the present folder.
         """
@@ -145,9 +141,6 @@ class EnvironmentRecord:
         Args:
             where: The file of this record, for messages.
             task: Another one, as :func:`use_task` returns it.
-
-        Raises:
-            ValueError: If its code has changed or gone.
         """
         if task is not None:
             return task

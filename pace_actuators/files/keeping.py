@@ -14,9 +14,6 @@ def refuse_taken(paths: Iterable[str | Path], *, option: str, overwrite: bool, o
         option: The option that says where, for the message.
         overwrite: Whether the user said that files may be replaced.
         own: Files of a run's folder that bear the names this program gives them: they are its own, and are replaced.
-
-    Raises:
-        ValueError: If a path is a folder or a device, leads through a file, or is a file that may be the user's.
     """
     files, ours = [Path(path) for path in paths], {Path(path).absolute() for path in own}
     for path in files:
@@ -30,11 +27,7 @@ def refuse_taken(paths: Iterable[str | Path], *, option: str, overwrite: bool, o
 
 
 def refuse_place(path: Path, *, option: str) -> None:
-    """Refuse a path where no file can be.
-
-    Raises:
-        ValueError: If it is a folder or a device, or leads through a file.
-    """
+    """Refuse a path where no file can be."""
     if path.is_dir():
         raise ValueError(f"{option} {path}: is a folder; expected a file. Add a file's name.")
     if path.exists() and not path.is_file():

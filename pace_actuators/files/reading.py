@@ -19,11 +19,7 @@ def file_at(path: str | Path, cure: str) -> Path:
     """The path of a regular file, which can be opened.
 
     Args:
-        path: Where it should be.
         cure: What to do if it is not, a sentence.
-
-    Raises:
-        ValueError: If it does not exist, or is a folder, a pipe or a loop of links.
     """
     path = Path(path)
     try:
@@ -40,11 +36,7 @@ def read_json(path: str | Path, cure: str) -> Any:
     """What a JSON file holds.
 
     Args:
-        path: The file.
         cure: What to do if it is missing or damaged, a sentence.
-
-    Raises:
-        ValueError: If it is missing, or no JSON.
     """
     path = file_at(path, cure)
     try:
@@ -58,7 +50,6 @@ def parsed_json(text: str) -> Any:
     """What a text of JSON says.
 
     Raises:
-        ValueError: If it is no JSON, or holds half a character (a lone surrogate), which no file can be written with.
         RecursionError: If it is nested too deeply.
     """
     content = json.loads(text)
@@ -71,11 +62,7 @@ def read_tensors(path: str | Path, cure: str) -> Any:
     """What ``torch.save`` wrote: tensors, numbers, text, lists and dicts; nothing in the file is executed.
 
     Args:
-        path: The file.
         cure: What to do if it is missing or damaged, a sentence.
-
-    Raises:
-        ValueError: If it is missing or damaged, holds other objects, or a tensor larger than the file's data.
     """
     path = file_at(path, cure)
     try:

@@ -20,13 +20,9 @@ def checked(cls: type[T], content: Any, source: object, cure: str, *, strict: bo
 
     Args:
         cls: The dataclass. A key that it does not have is left out; one that the file does not have keeps its default.
-        content: The file's content.
         source: The file, and the place in it, for messages.
         cure: What to do if something is wrong, a sentence.
         strict: Whether a key that the dataclass does not have is refused.
-
-    Raises:
-        ValueError: If a key is missing, or its value is of another type; numbers must be finite.
     """
     if not isinstance(content, Mapping):
         refuse(source, f"holds {_shown(content)}, expected an object with keys", cure)
@@ -45,11 +41,7 @@ def checked(cls: type[T], content: Any, source: object, cure: str, *, strict: bo
 
 
 def refuse(source: object, what: str, cure: str) -> NoReturn:
-    """Say what is wrong with a file.
-
-    Raises:
-        ValueError: Always.
-    """
+    """Say what is wrong with a file."""
     raise ValueError(f"{source}: {what}. {cure}")
 
 

@@ -20,7 +20,6 @@ def write_atomically(path: Path, write: Writer) -> None:
     """Write a file through a temporary one beside it.
 
     Args:
-        path: The file.
         write: Gets the open binary file.
 
     Raises:

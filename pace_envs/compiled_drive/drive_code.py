@@ -48,7 +48,6 @@ class DriveCode(Names):
         """Find what is needed.
 
         Args:
-            program: What is done.
             own: Before the names of what is kept from part to part; it is declared there, else by :meth:`begin`.
             prefix: Before the names of tables.
         """
@@ -109,7 +108,6 @@ class DriveCode(Names):
         """What a part does.
 
         Args:
-            part: Its number.
             special: Writes what series and MuJoCo's fields are, and what MuJoCo is given.
             shown: Writes what is shown, in the first part.
         """

@@ -236,9 +236,7 @@ class TracedDelay(DelayBuffer):
         """Stand for a delay.
 
         Args:
-            tracer: Notes.
             lag: Makes what stands for it, in steps, the lead included.
-            like: The delay.
         """
         self.interpolation, self.parts, self._length = like.interpolation, like.parts, like._length
         self._tracer, self._make_lag = tracer, lag
@@ -278,7 +276,6 @@ class OneJoint:
 
         Args:
             robot: Whose drive it is; it has made a control step: what happens only in the first one is not noted.
-            actuator: The drive.
             rows: Environments, in all of which the same effects act.
         """
         self.tracer = JointTracer()
@@ -398,7 +395,6 @@ class OneJoint:
         Args:
             holder: The copy's attributes, or a dictionary.
             true: Those of which it is a copy.
-            key: The tensor's.
             begin: The environment of its first row.
             columns: The joints' in it; ``None`` where it has no others.
         """

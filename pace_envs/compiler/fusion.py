@@ -34,8 +34,6 @@ class Fusion(Tracer):
         """Prepare.
 
         Args:
-            rows: Number of environments.
-            device: Of their tensors.
             compiler: Compiles kernels for it.
         """
         super().__init__()

@@ -108,11 +108,7 @@ def _driver() -> ctypes.CDLL:
 
 @lru_cache(maxsize=1)
 def _compiler() -> ctypes.CDLL:
-    """NVRTC: the one in torch's own packages, or the system's.
-
-    Raises:
-        ValueError: If NVRTC is not found.
-    """
+    """NVRTC: the one in torch's own packages, or the system's."""
     version = (torch.version.cuda or "").split(".")[0]
     packages = Path(torch.__file__).parents[1] / "nvidia"
     own = [path for path in glob.glob(f"{packages}/*/lib/libnvrtc.so*") if ".alt." not in path]

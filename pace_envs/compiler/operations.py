@@ -112,7 +112,6 @@ def rule(name: str, arguments: Sequence[Any], options: dict[str, Any], dtype: to
     Args:
         name: Of the operation, without underscore.
         arguments: Its arguments, tensors and numbers.
-        options: By name.
         dtype: Type of the result.
     """
     form, is_real = _FORMS.get(name), dtype.is_floating_point

@@ -60,9 +60,7 @@ class Tracer(TorchDispatchMode):
         """The result of an operation that is noted; ``None`` where that cannot be.
 
         Args:
-            func: Torch's operation.
             name: Its name, without the underscore of those in place.
-            args: Arguments.
             kwargs: Options, without ``out``.
             target: What it writes; ``None`` for a new tensor.
             tensors: Those among the arguments and options.

@@ -46,9 +46,6 @@ def read_drives(model: mujoco.MjModel) -> tuple[list[FileDrive], list[str]]:
 
     Args:
         model: The compiled model, with its actuators.
-
-    Raises:
-        ValueError: If an actuator is of a kind that no drive here follows.
     """
     found: dict[str, FileDrive] = {}
     notes: list[str] = []

@@ -64,10 +64,7 @@ def joint_facts(
     """Read the facts of some joints.
 
     Args:
-        model: The compiled model.
         home: Its home posture, (nq,).
-        names: The joints.
-        drives: Drives by joint.
         velocity_limits: Largest speeds by joint, where known.
         command: What joints without a drive in the file are commanded by, where known.
     """

@@ -110,13 +110,7 @@ class Term(Generic[CfgT]):
         """Resolve scene entities, build class terms and check the arguments.
 
         Args:
-            name: Name of the term.
-            cfg: Its configuration.
-            env: The environment.
             num_args: Number of arguments that come before its params: ``env``, and for events ``env_ids``.
-
-        Raises:
-            ValueError: If an argument is missing or unknown.
         """
         self.name = name
         self.cfg = cfg

@@ -57,7 +57,6 @@ class electrical_power(ManagerTermBase):
         """P_el [W], (num_envs,).
 
         Args:
-            env: The environment.
             copper_loss: R / (r² k²) [W/(N m)²], a number or by expression of joints.
             regeneration: Part of negative mechanical power that comes back, 0 to 1.
         """

@@ -30,13 +30,7 @@ def randomize_identified_drives(
 
     Args:
         env: The environment; its robot has the identified drives.
-        env_ids: All environments.
-        drives: What was identified.
         scale: Multiplies the standard deviations.
-        asset_cfg: The robot.
-
-    Raises:
-        ValueError: If it is not run for all environments at once (mode ``"startup"``).
     """
     if len(env_ids) != env.num_envs:
         raise ValueError("randomize_identified_drives draws all environments at once: use mode 'startup'.")

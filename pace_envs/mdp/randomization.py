@@ -26,11 +26,7 @@ def randomize_friction(
 def randomize_body_mass(
     env: ManagerBasedEnv, env_ids: torch.Tensor, asset_cfg: SceneEntityCfg, mass_range: tuple[float, float]
 ) -> None:
-    """Add a uniform draw [kg] to the mass of bodies; their inertia grows in proportion.
-
-    Raises:
-        ValueError: If a body's mass could become zero or less.
-    """
+    """Add a uniform draw [kg] to the mass of bodies; their inertia grows in proportion."""
     bodies = torch.as_tensor(asset_cfg.body_ids, device=env.device)
     nominal = env.sim.tensor(env.sim.model.body_mass)[bodies]
     if float(nominal.min()) + mass_range[0] <= 0.0:

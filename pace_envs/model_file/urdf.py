@@ -72,12 +72,7 @@ def read_urdf(text: str, path: Path, *, touches: bool = False) -> UrdfFacts:
     """Read a URDF.
 
     Args:
-        text: Its content.
-        path: Its file.
         touches: Whether the meshes of collisions stay, under the absolute paths of their files.
-
-    Raises:
-        ValueError: If it is not a URDF, still a xacro, or a number in it is invalid.
     """
     try:
         root = ElementTree.fromstring(_with_declared_prefixes(text.strip().strip("\0")))

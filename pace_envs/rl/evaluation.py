@@ -68,9 +68,6 @@ def evaluate(
         policy: Maps observations to actions.
         steps: Environment steps; by default one episode.
         on_step: Called after every step, to draw it.
-
-    Raises:
-        ValueError: If the environment is no velocity task.
     """
     base = env.unwrapped
     if not isinstance(base.cfg, VelocityEnvCfg):
@@ -129,11 +126,7 @@ class ReachEvaluation:
 def evaluate_reach(
     env: RslRlVecEnvWrapper, policy: Policy, steps: int | None = None, on_step: Callable[[], None] | None = None
 ) -> ReachEvaluation:
-    """Let a policy reach in all environments; the arguments are those of :func:`evaluate`.
-
-    Raises:
-        ValueError: If the environment is no reaching task, or no command is held for long enough.
-    """
+    """Let a policy reach in all environments; the arguments are those of :func:`evaluate`."""
     base = env.unwrapped
     if not isinstance(base.cfg, ReachEnvCfg):
         raise ValueError("This environment is no reaching task: its configuration is no ReachEnvCfg.")

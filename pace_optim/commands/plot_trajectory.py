@@ -103,11 +103,7 @@ def has_display() -> bool:
 
 
 def existing(path: Path) -> Path:
-    """The path.
-
-    Raises:
-        ValueError: If there is no such file.
-    """
+    """The path."""
     if not path.exists():
         raise ValueError(
             f"{path.parent} has no {path.name} yet: the fit has not ended. Wait, or go on with "

@@ -56,7 +56,6 @@ def dimensions_of(
     """Every dimension of one joint over all its recordings, whose samples follow each other.
 
     Args:
-        motions: Of each recording.
         times: Of each recording, (K_r,) [s].
         loads: Load torque in each recording, (K_r,) [N m], if known.
         enabled: Whether the drive gave torque in each recording, (K_r,) bool; ``None``: always.

@@ -128,9 +128,6 @@ def compare_joint(joint: str, j: int, tracks: Sequence[Track], joint_type: Joint
     """Analyse joint j of all recordings.
 
     Args:
-        joint: Its name.
-        j: Its index.
-        tracks: The recordings.
         joint_type: Whether it turns or slides.
     """
     floors = noise_floors(j, tracks)

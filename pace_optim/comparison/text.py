@@ -13,11 +13,7 @@ from .ladder import ladder_table
 
 
 def comparison_lines(content: dict[str, Any]) -> list[str]:
-    """A row per joint, the worst places, the ladder, as lines.
-
-    Args:
-        content: Of comparison.json.
-    """
+    """A row per joint, the worst places, the ladder, as lines."""
     joints = content["joints"]
     parts = [part for part in ("train", "validation") if part in content["rmse"]]
     values = [joint["rmse"].get(part) for joint in joints.values() for part in parts]
@@ -44,10 +40,7 @@ def _split(content: dict[str, Any], factor: float, name: str, labels: Sequence[s
     """The error of all joints, and the largest joint's, in each part of a dimension; nothing where it has one part.
 
     Args:
-        content: Of comparison.json.
         factor: From SI units to those of the table.
-        name: The dimension.
-        labels: Of its parts.
     """
     found = {joint: one["where"][name]["rms"] for joint, one in content["joints"].items() if name in one["where"]}
     if not found:

@@ -118,11 +118,7 @@ def make_collection_parser() -> Parser:
 
 
 def cfg_from_args(args: argparse.Namespace) -> CollectionCfg:
-    """The request that parsed arguments make.
-
-    Raises:
-        ValueError: If one is malformed.
-    """
+    """The request that parsed arguments make."""
     options = take_common_options(vars(args))
     drop_paces_options(options)
     added = options.pop("added_mass")

@@ -35,11 +35,7 @@ def design_motion(
         cfg: What is asked for.
         env: The robot, one environment.
         unoptimized: The motion to start from.
-        limits: The robot's.
         report: Gets lines of progress.
-
-    Raises:
-        ValueError: If the request cannot be met.
     """
     sim2real, robot = env.cfg.sim2real, env.scene["robot"]
     space = ParameterSpace.of(sim2real)
@@ -81,8 +77,6 @@ def expected_parameters(sim2real: PaceCfg, space: ParameterSpace, overrides: Map
     """Where the parameters are expected: as given, else as in ``sample_params``, else in the middle of the bounds.
 
     Args:
-        sim2real: The robot's configuration.
-        space: Its parameters.
         overrides: By name (all joints) or ``name/joint``.
     """
     middle = space.to_physical(torch.zeros(space.size, dtype=torch.float64)).tolist()

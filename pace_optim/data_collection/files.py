@@ -29,12 +29,8 @@ def plan_files(cfg: CollectionCfg, sim2real: PaceCfg, names: Sequence[str]) -> l
     """Name the files of every trajectory, and refuse what could not be written before the work is done.
 
     Args:
-        cfg: The request.
         sim2real: Says where files go that the request does not place.
         names: Names of the trajectories; with several, each adds its own to the stem of its files.
-
-    Raises:
-        ValueError: If a suffix is wrong, a path is taken, or two files have the same name.
     """
     _check("--output", cfg.output, SUFFIXES)
     _check("--export_command", cfg.export_command, (".csv",))

@@ -78,15 +78,10 @@ def simulate(
 
     Args:
         env: As many environments as trajectories.
-        trajectories: The targets.
-        space: The parameters.
         truth: Their true values, (size,).
         encoder: Reads the positions, bias taken off.
         drive: Gains and limits instead of the robot's; a field of ``None`` keeps the robot's.
         load: What the robot carries.
-
-    Raises:
-        ValueError: If the simulation diverges, or the load does not fit the robot.
     """
     robot = env.scene["robot"]
     drafts = draft_recordings(env, trajectories, drive, load)
@@ -126,11 +121,7 @@ def simulate(
 def draft_recordings(
     env: ManagerBasedEnv, trajectories: Sequence[Trajectory], drive: Drive, load: Load
 ) -> list[Recording]:
-    """Recordings before they are made, on the control grid: the encoder stays at the first target.
-
-    Raises:
-        ValueError: If the load does not fit the robot.
-    """
+    """Recordings before they are made, on the control grid: the encoder stays at the first target."""
     robot = env.scene["robot"]
     accepts_load = env.cfg.sim2real.apply_load is not None  # type: ignore[attr-defined]
     return [

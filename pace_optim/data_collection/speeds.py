@@ -19,11 +19,7 @@ def driven_by_speed(env: ManagerBasedRLEnv, cfg: CollectionCfg) -> tuple[str, ..
     """Joints whose drives follow speeds: those that the request names, and those without a proportional gain.
 
     Args:
-        env: The robot.
         cfg: What is asked for.
-
-    Raises:
-        ValueError: If nothing would move a joint, or the request names none.
     """
     names = np.array(env.scene["robot"].joint_names)
     own = {"stiffness": cfg.stiffness, "damping": cfg.damping}
@@ -50,11 +46,7 @@ def driven_by_speed(env: ManagerBasedRLEnv, cfg: CollectionCfg) -> tuple[str, ..
 
 
 def told_speeds(trajectory: Trajectory, by_speed: tuple[str, ...], cfg: CollectionCfg) -> Trajectory:
-    """The trajectory, with speeds for these joints.
-
-    Raises:
-        ValueError: If speeds cannot express it, or what is asked for takes positions.
-    """
+    """The trajectory, with speeds for these joints."""
     if not by_speed:
         return trajectory
     if trajectory.has_jumps:

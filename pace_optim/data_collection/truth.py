@@ -16,12 +16,7 @@ def true_parameters(cfg: PaceCfg, space: ParameterSpace, overrides: Mapping[str,
     """``PaceCfg.sample_params`` with some values replaced, as a vector (size,).
 
     Args:
-        cfg: The robot's configuration.
-        space: Its parameters.
         overrides: By name (all joints) or ``name/joint``; the latter win.
-
-    Raises:
-        ValueError: If a name is unknown, a value is not finite, or a parameter has none.
     """
     keys_of = {parameter.name: parameter.keys for parameter in space.parameters}
     values: dict[str, dict[str, float]] = {}

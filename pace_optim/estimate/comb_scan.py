@@ -22,8 +22,6 @@ def scanned(
     amplitudes follow from the best one. All joints are moved at once: what one of them does to another counts little.
 
     Args:
-        space: The parameters.
-        evaluator: Simulates.
         x: The end of a descent, normalised (size,).
         effects: The effects that are fitted.
         joints: The robot's joints, in order.

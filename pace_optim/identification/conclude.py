@@ -101,13 +101,8 @@ def conclude(
     """Write the result, then check it, and add what each check finds.
 
     Args:
-        run: What has ended.
         record: Where its environment comes from.
-        outcome: Where it ended.
         keep_interrupted: Whether an interruption ends the checks; otherwise it is passed on. The file stays.
-
-    Raises:
-        ValueError: If the simulation diverges where it ended.
     """
     end = _reached(run, outcome)
     checks: Sequence[Callable[[Optimization, _End], _End]] = _CHECKS

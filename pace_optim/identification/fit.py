@@ -177,7 +177,6 @@ def resume(
     """Go on with an interrupted fit; the result is that of one that was never interrupted.
 
     Args:
-        path: The run's folder.
         max_iteration: Another largest number of generations.
         progress: Shows how far it is.
         task: Where the run's environment is found now, if it has been moved.
@@ -216,13 +215,8 @@ def help_fit(processes: Processes, device: str, path: str | None = None, task: s
     """Simulate this process's share of the search's candidates, for the process that fits and writes.
 
     Args:
-        processes: All of them.
-        device: Where this one simulates.
         path: The run's folder, if it is resumed.
         task: As for :func:`resume`.
-
-    Raises:
-        ValueError: If another process is lost, or there is nothing here of what it fits.
     """
     start: Any = processes.agree(None)
     if start is None:

@@ -41,12 +41,7 @@ def conclude_own(run: Optimization, record: EnvironmentRecord, outcome: Outcome)
     fitted again, since least squares minimise another objective.
 
     Args:
-        run: What has ended.
         record: Where its environment comes from.
-        outcome: Where it ended.
-
-    Raises:
-        ValueError: If there the simulation diverges.
     """
     problem, x, settings = run.problem, outcome.x, run.settings
     run.progress.say("error bars of the objective")
@@ -106,8 +101,6 @@ def error_bars(run: Optimization, objective: Objective, x: torch.Tensor) -> tupl
     too small.
 
     Args:
-        run: Its evaluators simulate.
-        objective: What was minimised.
         x: The minimum, normalised (size,).
     """
     space, where = run.problem.space, run.evaluator.dataset.train

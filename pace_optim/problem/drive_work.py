@@ -43,7 +43,6 @@ def with_work(dataset: Dataset, env: ManagerBasedRLEnv) -> Dataset:
     """The dataset with how hard the drives worked, where its recordings are of one session: they do not overlap.
 
     Args:
-        dataset: The recordings.
         env: The environment, whose facts hold where a recording states none.
     """
     begins, ends, squares = [], [], []

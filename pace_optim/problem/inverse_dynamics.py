@@ -41,7 +41,6 @@ class LinkMotion:
         """Of n joints.
 
         Args:
-            model: The links.
             joints: Names, (n,); motors that move several joints among them.
             position: (K, n) [rad].
             speed: (K, n) [rad/s].

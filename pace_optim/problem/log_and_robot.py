@@ -28,9 +28,6 @@ def without_loops_of_torques(env: ManagerBasedRLEnv, recording: Recording) -> Re
     """The recording; a torque that it commands is all that moves a joint, where the gains are only assumed.
 
     A damping that the recording states stays: it acts on the measured speed.
-
-    Raises:
-        ValueError: If a joint gets only positions, and its drive has no position loop.
     """
     drive, names = recording.drive, np.array(recording.joint_names)
     stiffness, damping = (
@@ -93,9 +90,6 @@ def refuse_open_loops(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -
     Args:
         env: The environment; its first simulation takes each posture.
         recordings: On the robot's joints, in its order.
-
-    Raises:
-        ValueError: If one cannot; the message says how far its loop is open.
     """
     robot = env.scene["robot"]
     loops = robot.closed_loops

@@ -25,9 +25,6 @@ def on_moving_base(recording: Recording, env: ManagerBasedEnv) -> Recording:
     Args:
         recording: On the robot's joints and control grid.
         env: The robot, its base fixed in the model.
-
-    Raises:
-        ValueError: If the model has no such IMU or foot, or the IMU is not on the base.
     """
     if recording.base_ang_vel is None or recording.base_lin_acc is None:
         return recording
@@ -88,11 +85,7 @@ def _swings(recording: Recording, names: Sequence[str], legs: Sequence[Sequence[
 
 
 def imu_pose(model: mujoco.MjModel, imu: ImuPose, label: str) -> tuple[np.ndarray, np.ndarray]:
-    """The IMU's axes as columns in the model's world, (3, 3), and where it is, (3,) [m].
-
-    Raises:
-        ValueError: If there is no such site or body, or joints move it.
-    """
+    """The IMU's axes as columns in the model's world, (3, 3), and where it is, (3,) [m]."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     if imu.body:
@@ -125,12 +118,8 @@ def joints_of_feet(env: ManagerBasedEnv, feet: Sequence[str], label: str) -> lis
     """For each foot, the joints that the ground holds where it stands, by index: all of its kinematic tree.
 
     Args:
-        env: The robot.
         feet: Bodies, geoms, sites or legs: a leg's name begins those of its joints.
         label: Of the recording, for messages.
-
-    Raises:
-        ValueError: If the model has nothing of that name.
     """
     robot, model = env.scene["robot"], env.sim.model
     names, trees, result = list(robot.joint_names), trees_of(env), []

@@ -135,7 +135,6 @@ class Problem:
         """Build the environment.
 
         Args:
-            num_envs: Number of environments.
             simulation: What builds its simulation; ``None`` keeps the configuration's.
         """
         cfg = copy.deepcopy(self.env_cfg)
@@ -342,11 +341,7 @@ class Facts:
         drive_dt: float | None = None,
         motors: Rows | None = None,
     ) -> Facts:
-        """Read what a task says of its robot; the arguments are those of :func:`load_problem`.
-
-        Raises:
-            ValueError: If it is no identification task, or the delay's mode or bounds are unusable.
-        """
+        """Read what a task says of its robot; the arguments are those of :func:`load_problem`."""
         of_file = motors if is_model_file(task) else None
         cfg = load_env_cfg(task, control_dt, of_file) if env_cfg is None else copy.deepcopy(env_cfg)
         if not isinstance(cfg, PaceSim2realEnvCfg):

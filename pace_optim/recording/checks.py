@@ -29,7 +29,6 @@ def check_recording(
 
     Args:
         fields: The file's keys and values; array-likes, text, numbers, dicts.
-        source: Path, for messages.
         default_name: The recording's name when the fields hold none.
         found: What the file calls its fields (a CSV's columns), for messages; default: the keys.
     """
@@ -331,11 +330,7 @@ def _check_commands(recording: Recording) -> None:
 
 
 def refuse_uncommanded(recording: Recording, names: Sequence[str]) -> None:
-    """Say which joints nothing commands.
-
-    Raises:
-        ValueError: Always.
-    """
+    """Say which joints nothing commands."""
     idle = [name for name, flag in zip(names, recording.is_commanded, strict=True) if not flag]
     raise ValueError(
         f"{recording.label}: {listed(idle)}: no command (des_dof_pos, des_dof_vel and des_dof_effort are NaN or "

@@ -57,9 +57,6 @@ def conform_recording(
         load_bodies: Bodies that `added_mass` may name.
         accepts_load: Whether the robot has the test bench's load (load_mass, load_length, arm_mass).
         undriven: Joints of the model that no drive moves.
-
-    Raises:
-        ValueError: If the recording does not fit the robot or its time base cannot be used.
     """
     if not (np.isfinite(control_dt) and control_dt > 0.0):
         raise ValueError(f"control_dt is {control_dt}; expected a time above zero [s]. Correct the argument.")

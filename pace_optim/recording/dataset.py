@@ -55,7 +55,6 @@ class Work:
         Args:
             time: Since the session began, (rows, 1) [s].
             time_constant: T, (rows, joints) [s].
-            joints: Which joints.
         """
         edges = (each.to(time_constant) for each in (self.begin, self.end))
         first, last = (torch.exp(-(time - edge).clamp(min=0.0)[:, :, None] / time_constant[:, None]) for edge in edges)
@@ -104,7 +103,6 @@ class Torques:
         """Those of a dataset's recordings.
 
         Args:
-            dataset: The recordings.
             channel: Which joints' torques count, and their noise.
             held: Whether drives hold their torques for a control step.
         """
@@ -346,9 +344,6 @@ def make_dataset(
         validation: Never trained on. Without any, the last part in time of each recording is kept for it.
         train_fraction: Which part of each recording is trained on when ``validation`` is empty; 1 keeps nothing. Of
             a base that moves, it is that part of every 4 s or so.
-
-    Raises:
-        ValueError: If there is no recording.
     """
     every = (*recordings, *validation)
     if not recordings:

@@ -54,11 +54,7 @@ def load_recording(path: str | os.PathLike[str], rate: float = 0.0) -> Recording
 
 
 def stated_couplings(paths: Sequence[str | os.PathLike[str]]) -> dict[str, dict[str, float]]:
-    """Motors that recordings and logs state, {motor: {joint: ratio}}: in themselves or in the JSON beside them.
-
-    Raises:
-        ValueError: If two of them contradict each other, or what one states is unusable.
-    """
+    """Motors that recordings and logs state, {motor: {joint: ratio}}: in themselves or in the JSON beside them."""
     found: dict[str, dict[str, float]] = {}
     first = ""
     for path in map(Path, paths):

@@ -53,7 +53,6 @@ def hold_on_grid(time: np.ndarray, values: np.ndarray, step: float, count: int) 
         time: Instants at which values are issued, (T,) [s], from 0.
         values: Values, (T, n).
         step: Spacing of the grid [s].
-        count: Number of steps.
     """
     edge = step * np.arange(count + 1)
     first = np.searchsorted(time, edge[:-1], side="right") - 1

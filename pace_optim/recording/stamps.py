@@ -25,9 +25,6 @@ def seconds_of(values: np.ndarray) -> tuple[np.ndarray, float, str]:
     Returns:
         Stamps, (T,) [s], from 0 where they are Unix time and as given elsewhere; Unix time at zero [s], or 0; the unit
         that was recognised, or "" where they were taken as they are.
-
-    Raises:
-        ValueError: If text is no date.
     """
     if values.dtype.kind in "UST":
         values = _dates(values)

@@ -39,9 +39,6 @@ def start_speed(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     Its standard deviation is σ_v and c₂ Δt together, Δt the time between samples: where a held command arrives, the
     acceleration 2 c₂ begins within them. A speed below 4 of them counts as zero: what begins at rest keeps exactly 0.
 
-    Args:
-        recording: Conformed or not.
-
     Returns:
         Speeds, (n,) [rad/s], and whether a polynomial fits, (n,) bool; as recorded where the recording holds speeds.
     """

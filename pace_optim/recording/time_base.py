@@ -56,9 +56,6 @@ def fit_time_base(time: np.ndarray, control_dt: float, source: str, may_place: b
         control_dt: Control step of the simulation [s].
         source: Name of the recording, for messages.
         may_place: Whether even samples that do not lie on the grid may be placed beside it, where they are slower.
-
-    Raises:
-        ValueError: If the recording is too slow, or has a gap that interpolation cannot honestly fill.
     """
     resolution = _resolution(time)
     time = time - time[0]

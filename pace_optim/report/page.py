@@ -27,9 +27,6 @@ def write_report(folder: str | Path) -> Path:
 
     Returns:
         The file.
-
-    Raises:
-        ValueError: If there is no result.
     """
     path = Path(folder) / "report.html"
     text = report_text(folder)
@@ -41,11 +38,7 @@ def report_text(folder: str | Path, new: Mapping[str, Any] | None = None) -> byt
     """The page's content.
 
     Args:
-        folder: The run's folder.
         new: Content of JSON files that are about to be written, by name, instead of the present one.
-
-    Raises:
-        ValueError: If there is no result, or a file is damaged; the message names it.
     """
     run = RunData.load(Path(folder), new)
     return render(run, make_sections(run)).encode()
@@ -55,21 +48,13 @@ def check_folder(folder: str | Path, *, anew: str = "") -> None:
     """Read all that the report of a run is made of, so that damage is reported before the work.
 
     Args:
-        folder: The run's folder.
         anew: The file that the work writes anew, which need not be sound.
-
-    Raises:
-        ValueError: If a file is damaged; the message names it.
     """
     make_sections(RunData.load(Path(folder), {anew: None}))
 
 
 def make_sections(run: RunData) -> list[Section]:
-    """All sections that the run's files are there for.
-
-    Raises:
-        ValueError: If a file that one is about is damaged; the message names it.
-    """
+    """All sections that the run's files are there for."""
     sections = []
     for make, name in SECTIONS.items():
         with run.blaming(name):

@@ -15,14 +15,10 @@ def write_replay(folder: str | Path, output: Path | None = None) -> Path:
     """Write ``replay.html`` of a run: one file that opens offline.
 
     Args:
-        folder: The run's folder.
         output: The file; ``None``: in the run's folder.
 
     Returns:
         The file.
-
-    Raises:
-        ValueError: If the run has no result, no trajectories or no model.
     """
     folder = Path(folder)
     run = RunData.load(folder)

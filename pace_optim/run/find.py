@@ -19,9 +19,6 @@ def find_run(log_dir: str | Path, robot_name: str | None = None, folder_name: st
         log_dir: Where runs are kept.
         robot_name: The robot's folder in it; ``None`` means that of the newest run.
         folder_name: The run's folder in that; ``None`` means the newest.
-
-    Raises:
-        ValueError: If it does not exist; the message lists those that do.
     """
     log_dir = Path(log_dir)
     robots = sorted(path.name for path in log_dir.iterdir() if _runs(path)) if log_dir.is_dir() else []
@@ -48,11 +45,7 @@ def find_run(log_dir: str | Path, robot_name: str | None = None, folder_name: st
 
 
 def find_mean(run: Path, mean_name: str) -> Path:
-    """A saved mean of a run's search, by the name of its file.
-
-    Raises:
-        ValueError: If it does not exist; the message lists those that do.
-    """
+    """A saved mean of a run's search, by the name of its file."""
     path = run / (mean_name if mean_name.endswith(".pt") else f"{mean_name}.pt")
     means = sorted(file.name for file in run.glob("mean_*.pt"))
     if path.name in means and path.parent == run:

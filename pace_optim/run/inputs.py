@@ -44,11 +44,7 @@ def input_digests(settings: FitSettings, record: EnvironmentRecord) -> dict[str,
 
 
 def check_unchanged(run: Run) -> None:
-    """See whether every file is what it was when the run was started.
-
-    Raises:
-        ValueError: If one has changed, gone or come.
-    """
+    """See whether every file is what it was when the run was started."""
     moved = {*run.record.files, *(entry["file"] for entry in run.record.code.values())} if run.overridden else set()
     for name, digest in (run.recordings | run.inputs).items():
         path = Path(name)
@@ -64,11 +60,7 @@ def check_unchanged(run: Run) -> None:
 
 
 def check_same_configuration(run: Run, problem: Problem) -> None:
-    """See whether the configuration is the one that the run was started with.
-
-    Raises:
-        ValueError: If a value differs.
-    """
+    """See whether the configuration is the one that the run was started with."""
     now = resolved(problem)
     now["configuration"]["sim2real"].pop("notes")  # words about the rest
     if run.overridden:

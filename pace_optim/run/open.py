@@ -51,9 +51,6 @@ class Run:
         Args:
             run: The run's folder, or its ``result.json``.
             task: Another environment, as :func:`pace_envs.task_source.use_task` returns it.
-
-        Raises:
-            ValueError: If it is no run, or the code of its environment has changed or gone.
         """
         folder = run_folder(run)
         path = folder / "settings.json"
@@ -88,9 +85,6 @@ class Run:
             effects: Other effects; ``None`` keeps its own.
             columns: Column map of logs among ``data``; ``None``: guessed.
             strict: Whether one of ``data`` that cannot be used refuses all, instead of being set aside.
-
-        Raises:
-            ValueError: If a recording has gone, or anything does not fit.
         """
         settings = self.settings
         if data:
@@ -180,11 +174,7 @@ def problem_of(settings: FitSettings, env_cfg: Any = None, tell: Callable[[str],
 
 
 def run_folder(run: str | Path) -> Path:
-    """The folder of a run, named by itself or by its ``result.json``.
-
-    Raises:
-        ValueError: If it does not exist.
-    """
+    """The folder of a run, named by itself or by its ``result.json``."""
     path = Path(run)
     if path.name == "result.json" and path.is_file():
         path = path.parent

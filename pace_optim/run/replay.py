@@ -15,15 +15,11 @@ def replay(run: Path, physical: torch.Tensor, task: str | None = None) -> dict[s
     """Simulate one parameter vector on the recordings of a run.
 
     Args:
-        run: The run's folder.
         physical: The parameters in the layout of the run's ``config.pt``, (size,).
         task: Another environment than the run's own.
 
     Returns:
         Trajectories as in ``best_trajectory.pt``.
-
-    Raises:
-        ValueError: If a recording has gone, or the vector does not fit.
     """
     problem = open_problem(run, task=task)
     if tuple(physical.shape) != (problem.space.size,):

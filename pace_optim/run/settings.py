@@ -118,11 +118,7 @@ class FitSettings:
     """The run of positions alone that this one, with torques, replaces if it is better; ``None`` replaces no run."""
 
     def __post_init__(self) -> None:
-        """Check what can be checked without reading anything, and leave out the JSON files beside recordings.
-
-        Raises:
-            ValueError: If a value is unusable.
-        """
+        """Check what can be checked without reading anything, and leave out the JSON files beside recordings."""
         if isinstance(self.optimizer, type):
             self.optimizer = f"{self.optimizer.__module__}:{self.optimizer.__qualname__}"
         if self.optimizer not in OPTIMIZERS and ":" not in self.optimizer:

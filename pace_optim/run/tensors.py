@@ -22,9 +22,6 @@ def read_trajectory(folder: Path) -> dict[str, Any]:
     """What ``best_trajectory.pt`` holds: ``joint_names``, and ``recordings`` with their series of K samples.
 
     Where the simulation has diverged, ``sim_dof_pos`` is NaN.
-
-    Raises:
-        ValueError: If it is missing or damaged; the message names the key.
     """
     path = folder / "best_trajectory.pt"
     if not os.path.lexists(path):
@@ -74,11 +71,7 @@ def _check_recording(entry: Any, where: str, joints: int) -> None:
 
 
 def read_bounds(folder: Path) -> dict[str, tuple[float, float]]:
-    """Lower and upper bound by label ``<parameter>/<joint>``, from ``config.pt``; empty without that file.
-
-    Raises:
-        ValueError: If it is damaged.
-    """
+    """Lower and upper bound by label ``<parameter>/<joint>``, from ``config.pt``; empty without that file."""
     path = folder / "config.pt"
     if not os.path.lexists(path):
         return {}
@@ -94,11 +87,7 @@ def read_bounds(folder: Path) -> dict[str, tuple[float, float]]:
 
 
 def read_mean(path: Path) -> torch.Tensor:
-    """A mean of the search, (size,).
-
-    Raises:
-        ValueError: If the file is missing or damaged.
-    """
+    """A mean of the search, (size,)."""
     content = read_tensors(path, "Name another mean, or fit again.")
     if not _is_series(content, 1):
         refuse(path, "holds no vector of finite numbers", "Name another mean, or fit again.")

@@ -59,7 +59,6 @@ def add_common_options(parser: argparse.ArgumentParser, *, run: bool = False, re
     """Options of every command that has to do with a robot.
 
     Args:
-        parser: The command's parser.
         run: Whether the command works on runs, which know their robot.
         required: Whether there is no way without ``--task``.
     """
@@ -79,9 +78,6 @@ def take_common_options(options: dict[str, Any]) -> dict[str, Any]:
     """Import what the user named by these options; returns them without those that have had their effect.
 
     ``effects``, if the command has it, may name code of the user's own too.
-
-    Raises:
-        ValueError: If something that was named cannot be imported.
     """
     from pace_actuators.effects import import_effect
     from pace_actuators.own_code import import_named

@@ -25,11 +25,7 @@ class ReachCommand(CommandTerm):
     cfg: ReachCommandCfg
 
     def __init__(self, cfg: ReachCommandCfg, env: ManagerBasedEnv):
-        """Find places that the arm reaches.
-
-        Raises:
-            ValueError: If the model has no such site or body, or it is nowhere high enough.
-        """
+        """Find places that the arm reaches."""
         super().__init__(cfg, env)
         env.scene["robot"].site_pose(cfg.site)  # complains if there is neither
         self._places = env.sim.tensor(_reachable(env, cfg))

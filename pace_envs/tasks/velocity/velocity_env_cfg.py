@@ -48,7 +48,6 @@ def velocity_env_cfg(
 
     Args:
         robot: The robot; its initial state is the stance, its drives run at 200 Hz.
-        feet: Expression of the feet.
         base: Expression of what ends an episode where it touches the ground; ``None`` for a base that does not collide:
             its tilt and height alone end an episode then.
         knees: Expression of what should not touch the ground.

@@ -75,8 +75,6 @@ def assess(
     descent ended early, and x goes on to the minimum here.
 
     Args:
-        problem: What was fitted.
-        evaluator: Simulates all recordings.
         colouring: Which entries are perturbed together.
         x: Normalised, (size,).
         ended: What ended there or near it, which knows the principal directions; ``None``: they are looked for.
@@ -181,8 +179,6 @@ def _late_forces(jacobian: Jacobian, evaluator: Evaluator, space: ParameterSpace
 
     Args:
         jacobian: On the training samples.
-        evaluator: Simulates these recordings.
-        space: The parameters.
         x: Normalised, (size,).
     """
     rollout, physical, slope = evaluator.rollout(1), space.to_physical(x), space.slope(x)
@@ -241,7 +237,6 @@ def make_probes(
         x: Normalised vector, (size,).
         around: Vectors around x that give the derivatives.
         trees: Groups of joints that do not influence each other.
-        joint_names: All joints, in order.
         shake: How far first positions are moved [rad].
     """
     moved, joints = _shaken(trees, joint_names, shake)

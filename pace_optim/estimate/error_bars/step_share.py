@@ -24,9 +24,7 @@ def change_without_step(
     """How the motion would change if the physics had no step, on the training samples, (K, R, n) [rad].
 
     Args:
-        problem: What was fitted.
         physical: The result, (size,).
-        there: Its residuals.
         phases: What these have taken out of free phases.
 
     Returns:
@@ -52,7 +50,6 @@ def step_share(
     Args:
         there: At the result, on the training samples.
         change: Of the residuals when the step goes, (K, R, n) [rad].
-        space: The parameters.
         x: The result, normalised (size,).
         known: Which parameters have an error bar, (size,) bool; the others stay.
     """

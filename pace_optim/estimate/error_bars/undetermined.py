@@ -35,7 +35,6 @@ def whole_delay(problem: Problem, delay: float, std: float | None) -> list[str]:
     of its steps, whatever their delay.
 
     Args:
-        problem: What was fitted.
         delay: As found [control steps].
         std: Its standard deviation [control steps].
     """
@@ -71,9 +70,7 @@ def undetermined(problem: Problem, x: torch.Tensor, uncertainty: Uncertainty, fa
     An encoder bias is open if others compensate for it exactly, such as the phase of a ripple on an unloaded joint.
 
     Args:
-        problem: What was fitted.
         x: The result, normalised (size,).
-        uncertainty: There.
         far: Whether the fit ended so far above the noise that error bars mean nothing: then they leave nothing open.
     """
     silent = set(uncertainty.no_influence)
@@ -121,10 +118,7 @@ def held_at_prior(
     are, and where that costs too much, only what has no influence.
 
     Args:
-        problem: What was fitted.
         x: The result, normalised (size,).
-        uncertainty: There.
-        labels: What is open.
         cfg: How the rest is fitted; ``None`` holds only what has no influence.
     """
     silent = [label for label in labels if label in uncertainty.no_influence]
@@ -155,9 +149,7 @@ def without_delay(
     the delay is inertia, kp times it viscous friction.
 
     Args:
-        problem: What was fitted.
         x: The result, normalised (size,).
-        uncertainty: There.
         held: Labels of what is held at its prior already.
         cfg: How the rest is fitted.
     """
@@ -187,9 +179,7 @@ def at_prior(problem: Problem, x: torch.Tensor, labels: list[str]) -> torch.Tens
     """A normalised vector (size,) with some entries at their prior.
 
     Args:
-        problem: What was fitted.
         x: Normalised, (size,).
-        labels: Which entries.
     """
     space = problem.space
     at = [space.labels.index(label) for label in labels]

@@ -210,7 +210,6 @@ class Links:
         """Of a recording.
 
         Args:
-            view: The recording.
             before: Of the same recording otherwise; joints that move alike under the same gravity are looked at once.
         """
         position = view.smooth(view.position)
@@ -264,9 +263,6 @@ def balances(view: View, links: Links, joints: Iterable[int], further: np.ndarra
     """The balance of some joints, without those that hardly move.
 
     Args:
-        view: The recording.
-        links: Of its motion.
-        joints: By index.
         further: Torques that may have any part in each joint's, (N, n, m) [N m].
     """
     result, counts = {}, moving(view, links)

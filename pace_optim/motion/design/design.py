@@ -107,9 +107,7 @@ def optimize_motion(
 
     Args:
         problem_of: Makes the robot's problem from trajectories.
-        sim2real: The robot's configuration.
         unoptimized: The motion asked for, made from the same request.
-        limits: The robot's.
         x: Where the parameters are expected to be, normalised (size,).
         excitation: Which kind of motion.
         min_frequency: Lower end of the widest band [Hz].

@@ -58,7 +58,6 @@ def information_of(
     Args:
         problem_of: Makes the robot's problem.
         trajectories: Of the same length.
-        limits: The robot's.
         x: Where the parameters are expected to be, normalised (size,).
     """
     problem = problem_of(trajectories[:1])
@@ -131,7 +130,6 @@ def _block(
     Args:
         derivatives: Change of the positions by each colour's step, (colours, T, n) [rad].
         initial: Derivatives by the first positions, (sets, T, n).
-        tree: Its joints.
         step: Signed step of every entry, (size,).
         colouring: Which entries belong to which colour and joints.
     """

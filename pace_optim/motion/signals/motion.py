@@ -72,7 +72,6 @@ class Motion:
         """Scale a signal to the robot.
 
         Args:
-            name: Name of the motion.
             signal: (T,), the same for all joints, or (T, n); within ±1.
             has_jumps: Whether it jumps on purpose.
         """

@@ -55,9 +55,6 @@ def write_command_csv(path: str | os.PathLike[str], trajectory: Trajectory) -> P
 
     Joints that follow speeds have ``des_dof_vel/<joint>``. Numbers have as many digits as it takes to read back the
     same. The file appears whole or not at all.
-
-    Raises:
-        ValueError: If the path does not end in ``.csv``.
     """
     path = Path(path)
     if path.suffix.lower() != ".csv":

@@ -23,12 +23,8 @@ def fields_of(log: Log, columns: ColumnMap, joint_names: Sequence[str]) -> tuple
     """The fields of a recording, and notes on how they came about.
 
     Args:
-        log: The log.
         columns: Where each series of each joint comes from.
         joint_names: The joints, in the order of the columns; each has a `dof_pos` in the map.
-
-    Raises:
-        ValueError: If the map names channels that the log has not, or the channels do not meet in time.
     """
     parts = {
         series: {name: _scaled(log, series, columns.joints[name][series]) for name in joint_names
@@ -99,7 +95,6 @@ def unused(log: Log, columns: ColumnMap, facts_from: Collection[str] = ()) -> st
     """The channels that no series comes from, in a sentence; a topic of which nothing is used as one.
 
     Args:
-        log: The log.
         columns: What is used of it.
         facts_from: Channels that facts were read from.
     """

@@ -72,11 +72,7 @@ _CURE = "Give --columns a column map, as pace import writes it."
 
 
 def read_map(path: Path) -> ColumnMap:
-    """Read a column map.
-
-    Raises:
-        ValueError: If it is no such map; the message names the key.
-    """
+    """Read a column map."""
     try:
         content = tomllib.loads(file_at(path, _CURE).read_text(encoding="utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -159,8 +155,6 @@ def write_map(path: Path, columns: ColumnMap, comments: tuple[str, ...] = ()) ->
     """Write a map that reads back the same.
 
     Args:
-        path: Where to.
-        columns: The map.
         comments: Lines for its head.
     """
     text = map_text(columns, comments)

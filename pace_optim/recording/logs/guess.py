@@ -89,7 +89,6 @@ def guess_map(log: Log, robot: Robot) -> Guess:
     """Find which channel is which series of which joint.
 
     Args:
-        log: The log.
         robot: The robot, as far as it is known.
     """
     notes: list[str] = []

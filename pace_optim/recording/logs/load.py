@@ -55,9 +55,6 @@ def load_recordings(
         robot: The robot's joints and limits; without it, the log's own names are kept.
         columns: Which column is what; without it, it is guessed.
         tell: Gets what a guess understood.
-
-    Raises:
-        ValueError: If nothing can be read; the message says all that is missing.
     """
     path = Path(path)
     if not is_log(path, columns):

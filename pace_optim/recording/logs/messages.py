@@ -34,12 +34,7 @@ STATE_DEFINITIONS = {
 
 
 def rows_of(message: Any, topic: str) -> Iterator[tuple[int, Names, np.ndarray]]:
-    """What a message says: instants after its stamp [ns], what the values are, and the values.
-
-    Args:
-        message: As deserialized.
-        topic: Its topic.
-    """
+    """What a message says: instants after its stamp [ns], what the values are, and the values."""
     joints = getattr(message, "joint_names", None)
     if joints is not None and hasattr(message, "points"):
         yield from _trajectory(message, topic)

@@ -8,11 +8,7 @@ from typing import Any
 
 
 def reader(module: str, path: Path) -> Any:
-    """Import a reader of logs.
-
-    Raises:
-        ValueError: If it is not installed; the message says how to install it.
-    """
+    """Import a reader of logs."""
     try:
         return import_module(module)
     except ImportError:

@@ -34,11 +34,7 @@ class _Rows:
 
 
 def read_rosbag(path: Path) -> Log:
-    """Read a bag; channels are called ``/topic:field[joint]``.
-
-    Raises:
-        ValueError: If it cannot be read, or the readers are not installed.
-    """
+    """Read a bag; channels are called ``/topic:field[joint]``."""
     highlevel = reader("rosbags.highlevel", path)
     typesys = reader("rosbags.typesys", path)
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE if path.suffix != ".bag" else typesys.Stores.ROS1_NOETIC)

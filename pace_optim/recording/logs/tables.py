@@ -41,9 +41,6 @@ def read_csv_log(path: Path, columns: ColumnMap | None) -> list[Log]:
     """Read a CSV of any names; cells may be empty where a column has no value at an instant.
 
     If the columns are called as joints are, and nothing more, the file's name says which series they are.
-
-    Raises:
-        ValueError: If it cannot be read as a table over time.
     """
     content, notes = read_table(path)
     names = [name for name in content if not is_time(name)]
@@ -55,11 +52,7 @@ def read_csv_log(path: Path, columns: ColumnMap | None) -> list[Log]:
 
 
 def read_parquet_log(path: Path, columns: ColumnMap | None) -> list[Log]:
-    """Read a parquet file or a LeRobot dataset (a folder with meta/info.json), one log per episode.
-
-    Raises:
-        ValueError: If it cannot be read as a table over time, or the reader is not installed.
-    """
+    """Read a parquet file or a LeRobot dataset (a folder with meta/info.json), one log per episode."""
     parquet = reader("pyarrow.parquet", path)
     root = path if path.is_dir() else next((p for p in path.parents if (p / "meta" / "info.json").is_file()), None)
     info = _info(root) if root else {}
@@ -93,11 +86,7 @@ def read_parquet_log(path: Path, columns: ColumnMap | None) -> list[Log]:
 
 
 def _check_size(path: Path, metadata: Any) -> None:
-    """Refuse a parquet file that unpacks to more than can be read: of a constant it holds 1e8 in a megabyte.
-
-    Raises:
-        ValueError: If it has too many rows, or does not fit into memory.
-    """
+    """Refuse a parquet file that unpacks to more than can be read: of a constant it holds 1e8 in a megabyte."""
     if metadata.num_rows > _MOST_ROWS:
         raise ValueError(
             f"{path}: holds {metadata.num_rows:.3g} rows; expected at most {_MOST_ROWS:.0e} (28 h at 1 kHz). Cut it."

@@ -67,9 +67,6 @@ def read_table(path: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
     """The columns of a table by name, as numbers (NaN where empty) or text, and notes.
 
     Columns whose names come twice are left out: nothing says which is which.
-
-    Raises:
-        ValueError: If it is no table of text.
     """
     check_memory(_BYTES_PER_BYTE * path.stat().st_size, f"{path}: reading it", "Cut it.")
     try:

@@ -68,7 +68,6 @@ def guessed_units(
         series: `dof_pos`, ...
         known: The joints that have it, by name.
         positions: Positions whose unit was found before, in SI units, by joint.
-        of_positions: Their units.
 
     Raises:
         UnitUnknown: If a joint may be in either of two units.

@@ -152,7 +152,6 @@ def meaning(name: str, table: str = "") -> Meaning:
     """What a column's name says.
 
     Args:
-        name: The column's name.
         table: What names the topic or file, in which a command may be named.
     """
     unit, of_unit, without_unit = _unit(name)

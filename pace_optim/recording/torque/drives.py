@@ -51,7 +51,6 @@ class MeasuredDrives:
         """Within what unknown gains are refined that torques say: lower, start and upper factor, by label and joint.
 
         Args:
-            facts: Unknown facts.
             factors: The parameter that is a factor of each gain.
             sensed: Joints whose torques a fit follows: their gains are as unsure as their sensors' scales.
         """
@@ -96,7 +95,6 @@ def read_drives(
         control_dt: Control step [s].
         unknown: Facts that are stated and that are not to be believed.
         assumed: Joints without stated gains: the configured ones are assumed.
-        slides: Joints that slide.
         sensed: Joints whose torques a fit follows: a constant part is one of their sensors, and not of their drives.
     """
     laws: dict[str, dict[str, MeasuredLaw]] = {}

@@ -82,7 +82,6 @@ def read_law(recording: Recording, joint: int, longest_delay: float) -> Measured
 
     Args:
         recording: On the control grid (:func:`pace_optim.recording.conform_recording`).
-        joint: Its column.
         longest_delay: Up to where the delay of commands is sought [control steps].
     """
     table = Table.of(recording, joint, longest_delay, _phase(recording, joint, longest_delay))

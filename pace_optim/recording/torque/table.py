@@ -76,7 +76,6 @@ class Table:
             j: Column of the joint.
             longest_delay: Longest delay of commands [control steps].
             phase: When the drive runs, once a control step, of a log that does not sample it [control steps].
-            most: Samples at most.
             shift: By how much later its position and speed are taken [control steps].
         """
         log = recording if recording.logged is None else recording.logged

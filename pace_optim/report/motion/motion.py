@@ -53,13 +53,9 @@ def motions_of(
     ones.
 
     Args:
-        model: The compiled model.
         joint_names: The n joints that were measured.
         recordings: With columns in that order.
         encoder_bias: What an encoder shows beyond the joint's position, (n,) [rad or m].
-
-    Raises:
-        ValueError: If the model has no such joint.
     """
     driven = DrivenJoints.of_model(model, joint_names)
     columns = _columns(model, driven.joints)

@@ -17,8 +17,6 @@ def watch(model: mujoco.MjModel, motion: Motion, speed: float) -> None:
     """Play one recording again and again until the window is closed.
 
     Args:
-        model: The compiled model.
-        motion: What to show.
         speed: 1 is real time.
     """
     from mujoco import viewer
