@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pace_actuators.files import refuse_taken
 from pace_optim.report.motion import motions_of
-from pace_optim.report.replay_page import write_replay
+from pace_optim.report.page import write_replay
 from pace_optim.report.run_data import RunData
 from pace_optim.terminal.cli import make_parser
 from pace_optim.terminal.options import add_overwrite_option, number

@@ -23,7 +23,6 @@ from pace_envs.model_file.read import is_model_file
 from pace_envs.motor_coordinates import Rows
 from pace_envs.simulation import Simulation
 from pace_envs.tasks.pace import GLOBAL, PaceSim2realEnvCfg, sought_links
-from pace_optim.problem.base_path import BasePath, base_path
 from pace_optim.problem.bounds_of_logs import widen_bounds
 from pace_optim.problem.drive_steps import (
     check_loops,
@@ -43,7 +42,7 @@ from pace_optim.problem.log_and_robot import (
     told_of_gains,
     without_loops_of_torques,
 )
-from pace_optim.problem.moving_base import on_moving_base
+from pace_optim.problem.moving_base import BasePath, base_path, on_moving_base
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.recordings import Logs, conform_all, read_logs, tell_on_stderr
 from pace_optim.problem.unknown_facts import GAINS, LIMITS, lift_limits, refined_limits, with_unknown

@@ -16,9 +16,8 @@ from .checks import MIN_SAMPLES, refuse_uncommanded
 from .commands import GRID_COMMANDS, command_interval, commands_on_grid, timing_note
 from .data import Drive, Recording
 from .keys import CONDITIONS, FEET_SERIES, JOINT_SERIES, SAMPLED_SERIES
-from .resample import hold_on_grid, interpolate_linear, interpolate_smooth
 from .robot_checks import check_load, check_motion, column_order
-from .time_base import TimeBase, fit_time_base
+from .time_base import TimeBase, fit_time_base, hold_on_grid, interpolate_linear, interpolate_smooth
 
 _EARLY = 0.02
 """Part of a control step by which a torque that a loop gives may be stamped before it, as stamps jitter."""

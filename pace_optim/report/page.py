@@ -14,6 +14,30 @@ from pace_actuators.files import write_atomically
 from .markup import ENVIRONMENT, Section
 from .run_data import RunData
 from .sections import SECTIONS
+from .sections.replay import replay
+
+
+def write_replay(folder: str | Path, output: Path | None = None) -> Path:
+    """Write ``replay.html`` of a run: one file that opens offline.
+
+    Args:
+        output: The file; ``None``: in the run's folder.
+
+    Returns:
+        The file.
+    """
+    folder = Path(folder)
+    run = RunData.load(folder)
+    run.model()
+    section = replay(run)
+    if section is None:
+        raise ValueError(
+            f"{folder / 'best_trajectory.pt'} does not exist: the fit that made {folder} has not ended. Resume it."
+        )
+    path = output or folder / "replay.html"
+    write_atomically(path, lambda file: file.write(render(run, [section], figures=False).encode()))
+    return path
+
 
 _POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
 """Makes the browser refuse all that is not in the page itself."""

@@ -45,7 +45,9 @@ def head_of(path: Path) -> Head:
         UnicodeDecodeError, OSError, csv.Error: If it cannot be read as text.
     """
     with path.open(encoding="utf-8-sig", newline="") as file:
-        lines = [line for _, line in zip(range(_MOST_COMMENTS), iter(lambda: file.readline(_LONGEST_LINE), ""))]
+        lines = [
+            line for _, line in zip(range(_MOST_COMMENTS), iter(lambda: file.readline(_LONGEST_LINE), ""), strict=False)
+        ]
     above = list(itertools.takewhile(lambda line: not line.strip() or _COMMENT.match(line), lines))
     comments = [_COMMENT.sub("", line).strip().rstrip("\"'") for line in above if line.strip()]
     line = lines[len(above)] if len(above) < len(lines) else ""
