@@ -152,6 +152,32 @@ class Term(Generic[CfgT]):
             raise ValueError(f"The term {self.name!r} {wrong}. Params of its function: {', '.join(takes) or 'none'}.")
 
 
+class ManagerBase(Generic[CfgT]):
+    """A manager of terms that are functions."""
+
+    def __init__(self, cfg: Any, env: ManagerBasedEnv, *, num_args: int = 1):
+        """Resolve the terms of a dict, or of an object whose attributes are terms."""
+        self.terms: list[Term[CfgT]] = [
+            Term(name, term, env, num_args=num_args) for name, term in term_items(cfg).items()
+        ]
+
+    @property
+    def active_terms(self) -> Any:
+        """Names of the terms."""
+        return [term.name for term in self.terms]
+
+    @property
+    def takes_masks(self) -> bool:
+        """Whether a reset of environments that are not counted does what :meth:`reset` does."""
+        return not any(term.keeps_state for term in self.terms)
+
+    def reset(self, env_ids: torch.Tensor) -> dict[str, Number]:
+        """Reset class terms; returns numbers to log."""
+        for term in self.terms:
+            term.reset(env_ids)
+        return {}
+
+
 def term_items(cfg: Any) -> dict[str, Any]:
     """Terms by name, of a dict or of an object whose attributes are terms; ``None`` switches a term off."""
     if cfg is None:
