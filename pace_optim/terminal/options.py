@@ -24,6 +24,11 @@ def number(text: str) -> float:
     return value
 
 
+def add_several(parser: argparse._ActionsContainer, name: str, metavar: str, text: str, **more: Any) -> None:
+    """An option that takes one value or more."""
+    parser.add_argument(name, nargs="+", default=[], metavar=metavar, help=text, **more)
+
+
 def add_device_option(parser: argparse.ArgumentParser, needs: str = "pace-mujoco[gpu]") -> None:
     """Where a command simulates, and what a GPU needs."""
     parser.add_argument(
@@ -64,14 +69,8 @@ def add_common_options(parser: argparse.ArgumentParser, *, run: bool = False, re
     """
     default = "default: the run's own" if run else "pace list-envs lists them"
     parser.add_argument("--task", required=required, help=f"{_TASK} ({default})")
-    parser.add_argument(
-        "--import",
-        dest="imports",
-        nargs="+",
-        default=[],
-        metavar="MODULE",
-        help="import these modules or files of yours first: code that a run names and has no record of",
-    )
+    imports = "import these modules or files of yours first: code that a run names and has no record of"
+    add_several(parser, "--import", "MODULE", imports, dest="imports")
 
 
 def take_common_options(options: dict[str, Any]) -> dict[str, Any]:
