@@ -61,7 +61,7 @@ def test_options_of_walking_are_refused():
 
 
 @pytest.mark.slow
-def test_it_is_trained_played_and_judged(tmp_path):
+def test_it_is_trained_played_and_judged(tmp_path, no_export):
     run = train(RunSettings(task=TASK, num_envs=16, max_iterations=1, log_dir=str(tmp_path)))
     result = play(PlaySettings(checkpoint=str(run), num_envs=4, seconds=4.0))
     assert 0 < result.distance < 1 and "within 20 mm" in str(result)
