@@ -53,7 +53,11 @@ def check_representable(drives: IdentifiedDrives, world: World = HERE) -> list[s
     """What a world cannot represent of identified drives, or only with help, in words.
 
     Args:
+        drives: What was identified.
         world: Where it is to be used.
+
+    Raises:
+        ValueError: If an effect changes friction or reads the inertia at every step, and the world has no way to do so.
     """
     notes = [] if world.bodies else link_notes(drives)
     for cfg in drives.effects:
@@ -102,7 +106,11 @@ def link_notes(drives: IdentifiedDrives) -> list[str]:
 
 
 def refuse_inertia(motor: PaceDCMotor, world: World) -> None:
-    """Refuse a drive that needs the joint's inertia at every step, where the simulator does not give it."""
+    """Refuse a drive that needs the joint's inertia at every step, where the simulator does not give it.
+
+    Raises:
+        ValueError: If it does.
+    """
     if motor.needs_link and not world.inertia_per_step and motor.effects is not None:
         names = ", ".join(effect.name for effect in motor.effects.effects if effect.reads_link)
         raise ValueError(

@@ -18,8 +18,7 @@ from pace_actuators.effects.drive_state import DriveState
 from pace_actuators.part import Part
 from pace_envs.compiled_drive.drive_code import Program, Read
 from pace_envs.compiler.operations import COMPARED, TYPES, UNARY, rule
-from pace_envs.compiler.tape import Node, NotTraceableError, Tape
-from pace_envs.compiler.tracer import Tracer, tensors_in
+from pace_envs.compiler.tape import Node, NotTraceableError, Tape, Tracer, tensors_in
 from pace_envs.mdp import JointPositionAction
 
 if TYPE_CHECKING:

@@ -101,8 +101,8 @@ def cfg_from_model(
 ) -> PaceSim2realEnvCfg:
     """The identification environment of the robot in a model file, its base held in the air.
 
-    Joints and their order, gains, limits, armature, damping, friction, ranges and the home posture are the file's;
-    bounds and motion of each joint are scaled by its effort limit and inertia. What the file does not say is assumed
+    Joints and their order, gains, limits, armature, damping, friction, ranges and the home posture are the file's.
+    Bounds and motion of each joint are scaled by its effort limit and inertia. What the file does not say is assumed
     (:mod:`pace_envs.from_model.defaults`) and listed in ``sim2real.notes``.
 
     Args:

@@ -9,8 +9,8 @@ import torch
 from tensordict import TensorDict
 
 from pace_actuators import resolve_joint_values
-from pace_envs.articulation_data import of_floating_base
 from pace_envs.mdp import motor_power
+from pace_envs.robot_state import of_floating_base
 from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
 from pace_envs.tasks.reach import ReachEnvCfg
 from pace_envs.tasks.reach.reach_env_cfg import COMMAND

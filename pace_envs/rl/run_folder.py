@@ -9,7 +9,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from pace_actuators.files import checked, read_json, refuse, write_json
+from pace_actuators.files import checked, read_json, write_json
 from pace_envs.task_source import EnvironmentRecord
 
 SETTINGS_FILE = "settings.json"
@@ -78,18 +78,11 @@ class RunSettings:
         if not path.is_file():
             raise ValueError(f"{folder} holds no {SETTINGS_FILE}: it is not the folder of a training.")
         content = checked(cls, read_json(path, _CURE), path, _CURE)
-        record = _record(path, content.task)
+        record = EnvironmentRecord.read(read_json(path, _CURE).get("environment"), content.task, path, _CURE)
         content.task = record.use(str(path), task)
         if content.identified is not None and (folder / IDENTIFIED_FILE).is_file():
             content.identified = str(folder / IDENTIFIED_FILE)
         return content
-
-
-def _record(path: Path, task: str) -> EnvironmentRecord:
-    try:
-        return EnvironmentRecord.read(read_json(path, _CURE).get("environment"), task)
-    except (TypeError, AttributeError) as error:
-        refuse(path, str(error), _CURE)
 
 
 def new_run_folder(log_dir: str | Path, experiment_name: str) -> Path:

@@ -13,8 +13,7 @@ from matplotlib.figure import Figure
 from pace_actuators.files import refuse_taken, write_together
 from pace_optim.report.plots import plot_scores, plot_trajectories
 from pace_optim.run.history import History
-from pace_optim.run.open import find_mean, find_run, newest_mean, run_folder
-from pace_optim.run.replay import replay
+from pace_optim.run.open import find_mean, find_run, newest_mean, replay, run_folder
 from pace_optim.run.result import FitResult
 from pace_optim.run.tensors import read_mean, read_trajectory
 from pace_optim.terminal.cli import make_parser

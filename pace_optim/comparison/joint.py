@@ -13,9 +13,8 @@ from pace_actuators.joint_units import JointType
 from pace_optim.recording.noise import NoiseFloor, noise_floor, with_repetitions
 from pace_optim.run.tensors import rms
 
-from .dimensions import Dimension, dimensions_of
+from .dimensions import Dimension, Motion, dimensions_of, motion_of
 from .error_regions import Place, joint_sentence, places_of
-from .motion import Motion, motion_of
 from .regions import lay_out
 from .tracks import Track
 from .words import band_text

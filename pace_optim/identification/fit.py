@@ -21,14 +21,14 @@ from pace_optim.problem.recordings import tell_nobody, tell_on_stderr
 from pace_optim.recording.torque import NoTorqueError
 from pace_optim.report import check_folder, write_report
 from pace_optim.run.folder import RunFolder
-from pace_optim.run.inputs import (
+from pace_optim.run.open import (
+    Run,
     check_same_configuration,
     check_unchanged,
     input_digests,
     recording_digests,
     with_absolute_paths,
 )
-from pace_optim.run.open import Run
 from pace_optim.run.result import FitResult, assumptions
 from pace_optim.run.settings import FitSettings
 from pace_optim.run.tensors import read_bounds

@@ -20,9 +20,8 @@ from scipy.spatial.transform import Rotation
 from pace_actuators.text import listed
 from pace_envs import ManagerBasedEnv
 from pace_envs.motor_coordinates import DrivenJoints
-from pace_optim.problem.bounded_least_squares import bounded_least_squares
 from pace_optim.problem.bounds_of_logs import asked_torque, gains
-from pace_optim.problem.inverse_dynamics import LinkMotion, frame_motion, model_of
+from pace_optim.problem.inverse_dynamics import LinkMotion, bounded_least_squares, frame_motion, model_of
 from pace_optim.problem.kinematic_trees import independent_trees
 from pace_optim.recording import Recording
 from pace_optim.recording.data import ImuPose

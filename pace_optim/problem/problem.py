@@ -22,7 +22,7 @@ from pace_envs.link_inertia import Reference
 from pace_envs.model_file.read import is_model_file
 from pace_envs.motor_coordinates import Rows
 from pace_envs.simulation import Simulation
-from pace_envs.tasks.pace import GLOBAL, PaceSim2realEnvCfg, sought_links
+from pace_envs.tasks.pace import GLOBAL, PaceCfg, PaceSim2realEnvCfg, sought_links
 from pace_optim.problem.bounds_of_logs import widen_bounds
 from pace_optim.problem.drive_steps import (
     check_loops,
@@ -187,15 +187,22 @@ class Problem:
         Args:
             bounds: Lower and upper bound by label, ``<parameter>/<joint>``; of this problem's parameters alone.
         """
-        plain, cfg = copy.deepcopy(self.plain_cfg), copy.deepcopy(self.env_cfg)
-        for each in (plain, cfg):
-            for name, own in each.sim2real.bounds.items():
+
+        def widen(sim2real: PaceCfg) -> None:
+            for name, own in sim2real.bounds.items():
                 keys = (GLOBAL,) if BASE_PARAMETERS[name].shared else self.joint_names
                 other = own.new_tensor(
                     [bounds.get(f"{name}/{key}", pair) for key, pair in zip(keys, own.tolist(), strict=True)]
                 )
-                low, high = torch.minimum(own, other)[:, 0], torch.maximum(own, other)[:, 1]
-                each.sim2real.set_bounds(name, low, high)
+                sim2real.set_bounds(name, torch.minimum(own, other)[:, 0], torch.maximum(own, other)[:, 1])
+
+        return self._changed(widen)
+
+    def _changed(self, change: Callable[[PaceCfg], object]) -> Problem:
+        """The same with another configuration of what is identified."""
+        plain, cfg = copy.deepcopy(self.plain_cfg), copy.deepcopy(self.env_cfg)
+        for each in (plain, cfg):
+            change(each.sim2real)
         return replace(self, plain_cfg=plain, env_cfg=cfg, space=ParameterSpace.of(cfg.sim2real))
 
     def with_physics_dt(self, physics_dt: float) -> Problem:
@@ -217,10 +224,7 @@ class Problem:
 
     def seeking(self, links: Sequence[Reference]) -> Problem:
         """The same with the inertial parameters of these links identified."""
-        plain, cfg = copy.deepcopy(self.plain_cfg), copy.deepcopy(self.env_cfg)
-        for each in (plain, cfg):
-            each.sim2real.links = tuple(links)
-        return replace(self, plain_cfg=plain, env_cfg=cfg, space=ParameterSpace.of(cfg.sim2real))
+        return self._changed(lambda sim2real: setattr(sim2real, "links", tuple(links)))
 
     def with_links(self, links: Mapping[str, LinkInertia]) -> Problem:
         """The same with these inertial parameters of links, which are not identified any more."""
@@ -231,11 +235,8 @@ class Problem:
 
     def on_positions(self) -> Problem:
         """The same without the torques that are followed."""
-        plain, cfg = copy.deepcopy(self.plain_cfg), copy.deepcopy(self.env_cfg)
-        for each in (plain, cfg):
-            each.sim2real.torque_offsets = {}
-        dataset, space = replace(self.dataset, torques=None), ParameterSpace.of(cfg.sim2real)
-        return replace(self, plain_cfg=plain, env_cfg=cfg, dataset=dataset, space=space)
+        without = self._changed(lambda sim2real: setattr(sim2real, "torque_offsets", {}))
+        return replace(without, dataset=replace(self.dataset, torques=None))
 
     @property
     def torque_noise(self) -> dict[str, float]:

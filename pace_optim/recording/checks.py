@@ -12,7 +12,7 @@ from pace_actuators.text import listed
 from .data import Recording
 from .facts import as_array, check_one_line, couplings_of, drive_of, feet_of, imu_of, joint_names_of, load_of
 from .keys import BASE_COLUMNS, COMMAND_SERIES, FACTS, JOINT_SERIES, POSE_COLUMNS, SERIES, closest
-from .stamps import seconds_of, set_back, unrounded
+from .time_base import seconds_of, set_back, unrounded
 
 _HUGE = 1e6
 """No joint turns so far or so fast [rad], [rad/s]."""

@@ -6,9 +6,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pace_actuators.files import checked, read_json, refuse
+from pace_actuators.files import checked, read_json
 from pace_actuators.own_code import absolute_reference
-from pace_envs.task_source import EnvironmentRecord
 from pace_optim.problem.unknown_facts import check_unknown
 from pace_optim.recording import without_fact_files
 from pace_optim.terminal.choices import OPTIMIZERS
@@ -180,10 +179,6 @@ class FitSettings:
         cure = "Start a new fit."
         content = checked(SettingsFile, read_json(path, cure), path, cure)
         settings = checked(cls, content.settings, f"{path}: settings", cure, strict=True)
-        try:
-            EnvironmentRecord.read(content.environment, settings.task)
-        except TypeError as error:
-            refuse(path, str(error), cure)
         return settings, content
 
 

@@ -23,8 +23,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from pace_actuators.identified import DRIVE_FIELDS
-from pace_optim.problem.bounded_least_squares import bounded_least_squares
-from pace_optim.problem.inverse_dynamics import LinkMotion, frame_motion, model_of
+from pace_optim.problem.inverse_dynamics import LinkMotion, bounded_least_squares, frame_motion, model_of
 from pace_optim.problem.moving_base import joints_of_feet
 from pace_optim.problem.problem import Problem
 from pace_optim.recording.moving_base import standing_feet

@@ -10,8 +10,7 @@ import numpy as np
 
 from pace_envs.tasks.pace import PaceCfg
 
-from .motion import Motion
-from .trajectory import Trajectory
+from .trajectory import Motion, Trajectory
 
 
 @dataclass(frozen=True, kw_only=True)

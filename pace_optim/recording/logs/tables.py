@@ -13,7 +13,7 @@ import numpy as np
 from pace_actuators.files import parsed_json
 from pace_actuators.memory import check_memory
 from pace_actuators.text import listed
-from pace_optim.recording.stamps import seconds_of, set_back, unix_unit, unrounded
+from pace_optim.recording.time_base import seconds_of, set_back, unix_unit, unrounded
 
 from .column_map import ColumnMap
 from .log import Log, cleaned

@@ -20,6 +20,9 @@ def looks_of(path: Path) -> mujoco.MjModel | None:
     """A model with the bodies of a model file and all that it shows; ``None`` if a mesh is missing or too large.
 
     Of a URDF its bodies are not connected. Only what is in a body's own frame is of use.
+
+    Args:
+        path: MJCF or URDF.
     """
     keep_quiet()
     try:

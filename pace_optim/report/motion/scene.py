@@ -28,6 +28,7 @@ def scene_of(model: mujoco.MjModel, looks: mujoco.MjModel | None = None) -> dict
     """What a robot looks like: its shapes, and bones from joint to joint of links that have none.
 
     Args:
+        model: The compiled model.
         looks: A model whose bodies have the shapes of those of the same name; ``None``: the model's own.
 
     Returns:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from problems import BENCH, env_cfg, make_problem, record
 
+from pace_optim.comparison.dimensions import motion_of
 from pace_optim.comparison.drive_loads import load_torques
 from pace_optim.comparison.error_regions import worst_places
 from pace_optim.comparison.joint import (
@@ -19,7 +20,6 @@ from pace_optim.comparison.joint import (
     share_above,
     whiteness,
 )
-from pace_optim.comparison.motion import motion_of
 from pace_optim.comparison.regions import best_region, evidence, lay_out
 from pace_optim.comparison.tracks import Track
 from pace_optim.recording import Load
