@@ -39,7 +39,6 @@ class DriveDelays(Part):
         Args:
             names: Of the signals that are delayed; all others pass.
             max_delay: Largest delay [control steps].
-            interpolation: Of the delay between samples.
             runs: Runs of the controller in a control step.
             parts: Calls of the drive from one run to the next.
         """

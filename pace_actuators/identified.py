@@ -329,7 +329,6 @@ def draw(drives: IdentifiedDrives, uniform: torch.Tensor, scale: float = 1.0) ->
 
     Args:
         uniform: Independent draws between 0 and 1, (n, ``len(labels_with_std(drives))``).
-        scale: Multiplies the standard deviations.
 
     Returns:
         {parameter: {joint or "all": (n,)}} of those that vary, in the units of the result (the delay in control steps

@@ -123,7 +123,6 @@ def import_recorded(module: str, code: CodeRecord, where: str, hint: str) -> Mod
     """Import a module that a file names, if its code is what the file's record says.
 
     Args:
-        module: Its name or its file.
         where: The file that names it, for messages.
         hint: What the user types to name it himself.
     """

@@ -183,7 +183,6 @@ def add_motors(spec: mujoco.MjSpec, rows: Rows, source: object) -> None:
     Args:
         spec: The model; it is changed.
         rows: How the motors turn with joints.
-        source: Its file, for messages.
     """
     joints, tendons = [joint.name for joint in spec.joints], [tendon.name for tendon in spec.tendons]
     for motor, row in rows.items():
@@ -224,7 +223,6 @@ class MotorCoordinates:
         """Look up the columns.
 
         Args:
-            driven: What the drives move.
             shared: Drives of a joint whose torque acts on joints that follow it too, such as a gripper's other finger,
                 {joint: {joint: ratio}}; Σ ratio q is the joint's own position where they follow. Armature and friction
                 of such a drive stay on its joint, as model files have them.
@@ -296,7 +294,6 @@ class MotorCoordinates:
         """Positions (..., nq) or speeds (..., nv) of driven joints; those that follow do not count.
 
         Args:
-            values: As the simulation shows them.
             columns: ``places`` or ``columns``.
         """
         result, count = values.clone(), len(self._driven)

@@ -108,7 +108,6 @@ class JointLayout:
 
         Args:
             joint_order: Their order, and motors that move several joints; ``None`` means the model's joints.
-            path: The model's file, for messages.
         """
         root, single = None, {}
         for j in range(model.njnt):
@@ -306,7 +305,6 @@ class RobotState:
         """Joints whose names match regular expressions.
 
         Args:
-            name_keys: One expression or several.
             preserve_order: Order by the expressions instead of by ``joint_names``.
 
         Returns:

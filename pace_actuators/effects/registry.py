@@ -81,7 +81,6 @@ def use_recorded_effects(effects: Sequence[str], code: CodeRecord, where: str) -
 
     Args:
         effects: What :meth:`EffectCfg.parse` reads.
-        where: The file, for messages.
     """
     for text in effects:
         if module := split_reference(text.partition("@")[0])[0]:

@@ -51,9 +51,6 @@ Writer = Callable[[IO[bytes]], object]
 def write_atomically(path: Path, write: Writer) -> None:
     """Write a file through a temporary one beside it.
 
-    Args:
-        write: Gets the open binary file.
-
     Raises:
         OSError: If it cannot be written; its ``filename`` is the path.
     """

@@ -49,7 +49,6 @@ class DriveCode(Names):
 
         Args:
             own: Before the names of what is kept from part to part; it is declared there, else by :meth:`begin`.
-            prefix: Before the names of tables.
         """
         self._program, self._own, self._prefix = program, own, prefix
         self.tape = tape = program.tape

@@ -338,7 +338,6 @@ class OneJoint:
 
         Args:
             decimation: Physics steps of a control step.
-            commands: What the robot follows.
             with_torques: Whether the motor's torque is shown, too.
             hold: Puts the joint where it is held, with :meth:`held`; ``None``: it is free.
 
@@ -416,7 +415,6 @@ class OneJoint:
         """What was noted.
 
         Args:
-            shown: What is shown of it.
             written: What was written into MuJoCo's fields before each physics step, and after the last.
 
         Raises:

@@ -31,11 +31,7 @@ class Fusion(Tracer):
     """
 
     def __init__(self, rows: int, device: torch.device, compiler: Compiler):
-        """Prepare.
-
-        Args:
-            compiler: Compiles kernels for it.
-        """
+        """Prepare."""
         super().__init__()
         self._space, self._compiler = RowSpace(rows, device), compiler
         self._operations: list[Operation] = []

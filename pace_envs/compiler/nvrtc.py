@@ -44,8 +44,6 @@ class Kernels:
 
         Args:
             source: Of a compiled kernel, whose function is called ``simulate``.
-            threads: How many are wanted.
-            width: Threads of a block.
             arguments: Tensors, which are handed over by address, and whole numbers.
         """
         values = [as_argument(each) for each in arguments]

@@ -136,11 +136,10 @@ _checked: set[tuple[str, str, int, int]] = set()
 def check_limits(path: Path, read: Callable[[], object], key: str = "") -> None:
     """Refuse a model file that takes too long, or too much memory, such as one that repeats a body 1e8 times.
 
-    MuJoCo cannot be interrupted while it reads. So the file is read in a forked process first, once; other faults of
+    MuJoCo cannot be interrupted while it reads. So the file is read in a forked process first, once. Other faults of
     the file are left to the next reader. Systems that cannot fork have no such limits.
 
     Args:
-        read: Reads, compiles and allocates it.
         key: Identifies this way of reading it.
     """
     info = path.stat()

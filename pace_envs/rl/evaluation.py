@@ -13,8 +13,7 @@ from pace_envs.mdp import motor_power
 from pace_envs.robot_state import of_floating_base
 from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
 from pace_envs.tasks.reach import ReachEnvCfg
-from pace_envs.tasks.reach.reach_env_cfg import COMMAND
-from pace_envs.tasks.reach.terms import distance
+from pace_envs.tasks.reach.reach_env_cfg import COMMAND, distance
 from pace_envs.tasks.velocity import VelocityEnvCfg
 
 _SETTLED = 2.0
@@ -65,7 +64,6 @@ def evaluate(
 
     Args:
         env: The environment, of a velocity task.
-        policy: Maps observations to actions.
         steps: Environment steps; by default one episode.
         on_step: Called after every step, to draw it.
     """

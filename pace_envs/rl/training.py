@@ -126,9 +126,6 @@ def train(settings: RunSettings, edit: EditCfg | None = None) -> Path | None:
     """Train a policy; returns the run's folder, with checkpoints and the exported policy.
 
     Of several processes that torchrun started, the first writes it; the others return ``None``.
-
-    Args:
-        edit: Changes the environment's configuration.
     """
     cfg = load_cfg(settings, edit)
     start = None if settings.start_from is None else find_checkpoint(settings.start_from)

@@ -76,8 +76,6 @@ def places_of(
     Args:
         error: All recordings', (K,) [rad].
         floor: σ at each sample, (K,) [rad].
-        dimensions: What to look along.
-        layouts: The error along each.
         bands: Edges (B + 1,) [Hz], and shares (B,) of the octaves and of the error above the floor.
     """
     above = error**2 - floor**2

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -35,8 +35,7 @@ from .cfg import CollectionCfg
 from .design import design_motion
 from .hidden import Hidden, simulate_hidden
 from .plot import plot_motion
-from .simulate import Encoder, Simulated, simulate
-from .truth import true_parameters
+from .simulate import Encoder, Simulated, simulate, true_parameters
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +105,8 @@ def collect(cfg: CollectionCfg, report: Callable[[str], None] = lambda text: Non
         simulated: list[Simulated] = []
         hidden: Hidden | None = None
         if truth is not None and cfg.effects:
-            hidden = simulate_hidden(cfg, trajectories, space=space, truth=truth, delay_mode=_delay_mode(env))
+            mode = next(iter(env.scene["robot"].actuators.values())).cfg.delay_mode
+            hidden = simulate_hidden(cfg, trajectories, space=space, truth=truth, delay_mode=mode)
             simulated = hidden.simulated
         elif truth is not None:
             simulated = simulate(
@@ -181,10 +181,6 @@ def _sim2real(env_cfg: Any, task: str) -> PaceCfg:
     return sim2real
 
 
-def _delay_mode(env: Any) -> Literal["command", "effort"]:
-    return next(iter(env.scene["robot"].actuators.values())).cfg.delay_mode
-
-
 def _limits_of(env: Any) -> MotionLimits:
     robot = env.scene["robot"]
     velocity, effort = np.full(robot.num_joints, np.inf), np.full(robot.num_joints, np.inf)
@@ -203,11 +199,7 @@ def _limits_of(env: Any) -> MotionLimits:
 
 
 def driven_by_speed(env: ManagerBasedRLEnv, cfg: CollectionCfg) -> tuple[str, ...]:
-    """Joints whose drives follow speeds: those that the request names, and those without a proportional gain.
-
-    Args:
-        cfg: What is asked for.
-    """
+    """Joints whose drives follow speeds: those that the request names, and those without a proportional gain."""
     names = np.array(env.scene["robot"].joint_names)
     own = {"stiffness": cfg.stiffness, "damping": cfg.damping}
     kp, kd = (of_joints(env, name) if value is None else np.full(len(names), value) for name, value in own.items())

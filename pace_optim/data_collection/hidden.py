@@ -62,7 +62,6 @@ def simulate_hidden(
     by one with the same seed are of one robot.
 
     Args:
-        cfg: What is asked for.
         truth: Their true values, (size,).
     """
     for name in cfg.effects:

@@ -23,8 +23,6 @@ def scanned(
 
     Args:
         x: The end of a descent, normalised (size,).
-        effects: The effects that are fitted.
-        joints: The robot's joints, in order.
     """
     result = None
     for cfg in (each for each in effects if each.effect_class.comb is not None):

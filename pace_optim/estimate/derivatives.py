@@ -128,7 +128,6 @@ def stencil(
 
     Args:
         x: Normalised vector, (size,).
-        colouring: Which entries are perturbed together.
         hessian: JᵀJ as it is known, (size, size), of which the principal directions are; ``None``: each entry alone.
         noise: The simulation's own noise, as :meth:`Stencil.noise` has it [rad].
         score: The score at x [rad²].

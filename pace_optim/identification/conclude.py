@@ -107,7 +107,6 @@ def conclude(
     """Write the result, then check it, and add what each check finds.
 
     Args:
-        record: Where its environment comes from.
         keep_interrupted: Whether an interruption ends the checks; otherwise it is passed on. The file stays.
     """
     end = _reached(run, outcome)

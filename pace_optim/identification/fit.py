@@ -109,7 +109,6 @@ def fit_with_torques(
 
     Args:
         settings: As for :func:`fit`; so are the others.
-        progress: Shows how far it is.
         processes: Who shares the search's candidates; where there are several, only the first fit is made.
     """
     progress = progress or ProgressLine()

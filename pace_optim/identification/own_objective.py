@@ -39,9 +39,6 @@ def conclude_own(run: Optimization, record: EnvironmentRecord, outcome: Outcome)
 
     Positions are simulated and compared too: the errors of ``rmse`` are theirs. Nothing is refined, held at a prior or
     fitted again, since least squares minimise another objective.
-
-    Args:
-        record: Where its environment comes from.
     """
     problem, x, settings = run.problem, outcome.x, run.settings
     run.progress.say("error bars of the objective")

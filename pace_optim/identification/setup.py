@@ -33,7 +33,6 @@ def load_for_fit(settings: FitSettings, env_cfg: Any = None, tell: Callable[[str
     """Read everything, refuse what cannot be fitted, and try the simulation out.
 
     Args:
-        settings: What to fit, and how.
         env_cfg: The configuration of a run's task; ``None`` loads that of the settings' task.
         tell: Gets how the recordings are understood, and warnings of them.
     """
@@ -89,7 +88,6 @@ def make_optimizer(
     """The search of a fit.
 
     Args:
-        processes: Who shares the search.
         around: Physical parameters (size,) around which a hybrid searches what it searches by magnitude; the rest it
             searches from the start of the parameters. ``None``: PACE's search, all from there.
     """
@@ -140,7 +138,6 @@ def check_size(problem: Problem, simulated: int, num_envs: int) -> None:
 
     Args:
         simulated: How many simulations the search makes at once.
-        num_envs: How many were asked for.
     """
     env = problem.make_env(1)
     each = bytes_per_env(env.sim.model) + _BYTES_PER_VALUE * problem.space.size

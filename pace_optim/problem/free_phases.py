@@ -192,11 +192,7 @@ def _whitened(columns: torch.Tensor, factor: torch.Tensor) -> torch.Tensor:
 
 
 def blocks_of(carried: Carried, trees: Sequence[Sequence[int]]) -> tuple[Block, ...]:
-    """The free phases of joints that move each other, where all of them are free, in parts.
-
-    Args:
-        trees: Groups of joints, by index.
-    """
+    """The free phases of joints that move each other, where all of them are free, in parts."""
     result = []
     for r in carried.moves.nonzero()[:, 0].tolist():
         for tree in trees:
@@ -333,7 +329,6 @@ def free_phases(
     little while it remembers a push.
 
     Args:
-        trees: Groups of joints, by index.
         change: What :class:`PhaseProbes` change of what encoders show at all control steps, (2 depth + 6, T, R, n).
         error: Of the candidate without those changes, (T, R, n) [rad].
         control_dt: [s].

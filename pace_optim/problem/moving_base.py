@@ -20,9 +20,9 @@ from scipy.spatial.transform import Rotation
 from pace_actuators.text import listed
 from pace_envs import ManagerBasedEnv
 from pace_envs.motor_coordinates import DrivenJoints
-from pace_optim.problem.bounds_of_logs import asked_torque, gains
 from pace_optim.problem.inverse_dynamics import LinkMotion, bounded_least_squares, frame_motion, model_of
 from pace_optim.problem.kinematic_trees import independent_trees
+from pace_optim.problem.log_and_robot import asked_torque, gains
 from pace_optim.recording import Recording
 from pace_optim.recording.data import ImuPose
 from pace_optim.recording.keys import did_you_mean
@@ -129,7 +129,6 @@ def joints_of_feet(env: ManagerBasedEnv, feet: Sequence[str], label: str) -> lis
 
     Args:
         feet: Bodies, geoms, sites or legs: a leg's name begins those of its joints.
-        label: Of the recording, for messages.
     """
     robot, model = env.scene["robot"], env.sim.model
     names, trees, result = list(robot.joint_names), trees_of(env), []
@@ -210,7 +209,6 @@ def standing_legs(
     Args:
         recording: On the robot's joints and control grid, with gains that are stated.
         env: The robot, its base fixed in the model.
-        legs: Joints of each, by index.
         frame: Angular velocity [rad/s] and specific force [m/s²] of the base at the samples, (T, 6).
         point: Where that force was measured, (3,) [m].
     """
@@ -372,7 +370,6 @@ def base_path(recording: Recording, model: mujoco.MjModel, joint_names: Sequence
     Args:
         recording: Conformed, its base as :func:`~pace_optim.problem.moving_base.on_moving_base` has it.
         model: The robot on a fixed base.
-        joint_names: Columns of the recording.
     """
     if recording.frame is None or not recording.base_moves:
         return None

@@ -23,7 +23,6 @@ from pace_envs.model_file.read import is_model_file
 from pace_envs.motor_coordinates import Rows
 from pace_envs.simulation import Simulation
 from pace_envs.tasks.pace import GLOBAL, PaceCfg, PaceSim2realEnvCfg, sought_links
-from pace_optim.problem.bounds_of_logs import widen_bounds
 from pace_optim.problem.drive_steps import (
     check_loops,
     least_armature,
@@ -33,13 +32,16 @@ from pace_optim.problem.drive_steps import (
     set_drive_rate,
     set_drive_step,
 )
-from pace_optim.problem.drive_work import drive_reach, loop_stiffness, with_work
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.kinematic_trees import independent_trees
 from pace_optim.problem.log_and_robot import (
     contradicted_limits,
+    drive_reach,
+    loop_stiffness,
     refuse_open_loops,
     told_of_gains,
+    widen_bounds,
+    with_work,
     without_loops_of_torques,
 )
 from pace_optim.problem.moving_base import BasePath, base_path, on_moving_base

@@ -132,7 +132,6 @@ def conform_all(
         env: The robot, its other joints held.
         control_dt: Control step [s].
         strict: As for :func:`read_logs`.
-        tell: Gets what was set aside.
     """
     robot, known = env.scene["robot"], known_robot(env)
     sim2real, model = env.cfg.sim2real, env.sim.model  # type: ignore[attr-defined]

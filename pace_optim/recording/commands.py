@@ -26,7 +26,6 @@ def commands_on_grid(recording: Recording, base: TimeBase, control_dt: float) ->
 
     Args:
         recording: Before its samples were put on the grid; no sample comes before its first command.
-        base: How they are put there.
         control_dt: Control step [s].
     """
     stride, count = base.sample_stride, base.num_steps

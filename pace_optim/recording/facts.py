@@ -63,7 +63,6 @@ def drive_of(fields: Mapping[str, Any], joint_names: tuple[str, ...], commanded:
     """Read the drive's facts: a number for all joints, one per joint in column order, or {joint: value}.
 
     Args:
-        fields: The file's keys and values.
         joint_names: Names of the columns, () without names.
         commanded: Which columns have commands, (n,) bool: the others may be left out of {joint: value}.
     """

@@ -50,7 +50,6 @@ def affordable(
         columns: Parameters whose derivatives are computed each by itself.
         evaluations: Of the accelerations in a control step.
         max_duration: How long each may be [s]; ``None``: as long as there are not too many derivatives.
-        tell: Gets what was left out.
     """
     every = [recording for group in recordings for recording in group]
     per_second = columns * max((recording.num_joints for recording in every), default=1) / control_dt

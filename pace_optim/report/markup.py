@@ -91,7 +91,6 @@ def figure(
     """A plotly figure, which the page's script draws in the page's colours.
 
     Args:
-        id: Its name in the page.
         data: Traces. A colour may be one of the style sheet's, as ``"var(--simulated)"``.
         layout: What differs from the page's plain look.
         views: Ways to look at it, one button each: {"label": str, "trace": {...}, "layout": {...}} as

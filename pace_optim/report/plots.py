@@ -36,7 +36,6 @@ def plot_trajectories(
     Args:
         best_trajectory: The content of ``best_trajectory.pt``.
         joint_types: Whether each joint turns or slides; none: all turn.
-        title: Written before the recording's name.
         make_figure: Makes a figure of a ``figsize`` and ``layout``; ``matplotlib.pyplot.figure`` to see it on screen.
 
     Returns:

@@ -108,7 +108,6 @@ class RunFolder:
         Args:
             digests: SHA-256 of each recording.
             inputs: SHA-256 of each other file that was read; ``None`` where there was none.
-            environment: Where the environment comes from.
         """
         write_model(problem, self.path / "model.mjb")
         content: dict[str, Any] = {

@@ -33,7 +33,6 @@ def find_run(log_dir: str | Path, robot_name: str | None = None, folder_name: st
     """The folder of a run.
 
     Args:
-        log_dir: Where runs are kept.
         robot_name: The robot's folder in it; ``None`` means that of the newest run.
         folder_name: The run's folder in that; ``None`` means the newest.
     """
@@ -161,7 +160,6 @@ class Run:
         """The problem that the run solves, on its own recordings or on others.
 
         Args:
-            data: Recordings instead of the run's.
             physics_dt: Another physics step [s]; ``None``: that of its result.
             effects: Other effects; ``None`` keeps its own.
             columns: Column map of logs among ``data``; ``None``: guessed.

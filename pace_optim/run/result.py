@@ -258,7 +258,6 @@ def make_result(
 
     Args:
         x: The best normalised vector, (size,).
-        residuals: Of x on all samples.
         facts: The remaining fields of :class:`FitResult`.
     """
     data, space = problem.dataset, problem.space

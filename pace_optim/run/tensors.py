@@ -18,17 +18,22 @@ _LARGEST = 1e15
 _SERIES = ("des_dof_pos", "dof_pos", "sim_dof_pos")
 
 
+def existing(path: Path) -> Path:
+    """The path of a file that a fit writes at its end."""
+    if not os.path.lexists(path):
+        raise ValueError(
+            f"{path.parent} has no {path.name} yet: the fit has not ended. Wait, or go on with "
+            f"scripts/fit.py --resume {shlex.quote(str(path.parent))}"
+        )
+    return path
+
+
 def read_trajectory(folder: Path) -> dict[str, Any]:
     """What ``best_trajectory.pt`` holds: ``joint_names``, and ``recordings`` with their series of K samples.
 
     Where the simulation has diverged, ``sim_dof_pos`` is NaN.
     """
-    path = folder / "best_trajectory.pt"
-    if not os.path.lexists(path):
-        raise ValueError(
-            f"{folder} has no {path.name} yet: the fit has not ended. Wait, or go on with "
-            f"scripts/fit.py --resume {shlex.quote(str(folder))}"
-        )
+    path = existing(folder / "best_trajectory.pt")
     content = _dict(read_tensors(path, _ANEW), path, ("joint_names", "recordings"))
     names, recordings = content["joint_names"], content["recordings"]
     if not (isinstance(names, list) and names and all(isinstance(name, str) for name in names)):

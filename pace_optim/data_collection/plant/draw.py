@@ -189,7 +189,6 @@ def with_background(
     Their sizes are drawn, then scaled by one factor that three or four simulations find.
 
     Args:
-        drawn: What to add to.
         size: RMS change of the motion by all of them together [rad].
         count: How many, at most.
     """

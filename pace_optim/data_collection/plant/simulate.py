@@ -28,7 +28,6 @@ def simulate_runs(
     encoder at the first target.
 
     Args:
-        task: Identification task, or a robot.
         runs: Commands, gains and loads of each recording; commands of the same length.
         cfg: How the plant is stepped and measured.
     """

@@ -97,7 +97,6 @@ def per_joint(value: PerJoint, joint_names: Sequence[str], default: float, what:
     Args:
         value: A number, or {joint or regular expression: number}.
         default: Value of joints that no key covers.
-        what: Its name, for messages.
     """
     if not isinstance(value, Mapping):
         return np.full(len(joint_names), float(value))

@@ -65,7 +65,6 @@ def check_consistency(
         x: Its result, normalised (size,).
         score: Its score [rad²].
         there: Residuals and derivatives at x on the training samples; ``None``: they are simulated.
-        report: Gets a line of progress.
     """
     trained = problem.dataset.trained()
     problem = replace(problem, dataset=problem.dataset.select(trained))

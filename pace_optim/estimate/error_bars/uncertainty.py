@@ -124,7 +124,6 @@ def uncertainty_of(
     Args:
         hessian: H = JᵀJ, normalised (size, size) [rad²].
         middle: JᵀΣJ, normalised (size, size) [rad⁴].
-        colouring: Which joints each entry moves.
         x: The optimum, normalised (size,).
         held: Labels of what is held where it is.
     """

@@ -160,7 +160,6 @@ def without_delay(
     Args:
         x: The result, normalised (size,).
         held: Labels of what is held at its prior already.
-        cfg: How the rest is fitted.
     """
     space = problem.space
     at = space.labels.index(DELAY)

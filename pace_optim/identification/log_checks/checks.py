@@ -690,7 +690,6 @@ def checked(problem: Problem, trust: bool = False) -> Problem:
     """The problem with what is wrong with its log among its contradictions, and with IMUs that are late in time.
 
     Args:
-        problem: What is to be fitted.
         trust: Whether a log that no fit can be right of is only warned of.
     """
     found = check_log(problem)

@@ -110,13 +110,10 @@ def optimize_motion(
         problem_of: Makes the robot's problem from trajectories.
         unoptimized: The motion asked for, made from the same request.
         x: Where the parameters are expected to be, normalised (size,).
-        excitation: Which kind of motion.
         min_frequency: Lower end of the widest band [Hz].
         max_frequency: Upper end of the widest band [Hz].
         control_dt: Time between two targets [s].
         duration: Of the trajectory [s]; ``None`` means the excitation's usual one.
-        cfg: Settings of the search.
-        report: Gets a line of progress.
     """
     cfg = cfg or DesignCfg()
     rng = np.random.default_rng([cfg.seed, 2])

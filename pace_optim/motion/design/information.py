@@ -57,8 +57,6 @@ def information_of(
     """Simulate trajectories with the parameters x and with their neighbours, all in few batches.
 
     Args:
-        problem_of: Makes the robot's problem.
-        trajectories: Of the same length.
         x: Where the parameters are expected to be, normalised (size,).
     """
     problem = problem_of(trajectories[:1])
@@ -180,7 +178,6 @@ def expected_uncertainty(
     """The error bars that a fit would state.
 
     Args:
-        problem: The robot, with one recording.
         hessian: H, (size, size) [rad²].
         middle: M, (size, size) [rad²].
         noise: σ, standard deviation of the encoder's white noise [rad].

@@ -101,7 +101,6 @@ def rooms(
         cfg: The robot's configuration; its ``excitation`` must not be None.
         min_frequency: Lower end of the band [Hz].
         max_frequency: Upper end of the band [Hz].
-        reach: Factor of the range's width.
     """
     excitation = cfg.excitation
     assert excitation is not None  # an unoptimised motion was made from it
@@ -138,7 +137,6 @@ def command(
     """The targets of all joints, each its own motion; faster than its drive, a joint's amplitude is made smaller.
 
     Args:
-        excitation: Which kind of motion.
         control_dt: Time between two targets [s].
         duration: Of the trajectory [s]; ``None`` means the excitation's usual one.
 

@@ -138,11 +138,7 @@ def summarise(findings: Sequence[MotionFinding]) -> list[str]:
 
 
 def refuse_errors(findings: Sequence[MotionFinding], name: str, robot: str) -> None:
-    """Raise a ValueError that lists the errors among the findings.
-
-    Args:
-        robot: What to call the robot.
-    """
+    """Raise a ValueError that lists the errors among the findings."""
     errors = [finding.message for finding in findings if finding.is_error]
     if errors:
         more = f" And {len(errors) - 3} more." if len(errors) > 3 else ""

@@ -87,7 +87,6 @@ def next_experiments(
 
     Args:
         problem: The whole robot with the base model.
-        pairs: Models that cannot be separated.
         noise: Of each joint, (n,) [rad].
     """
     cfg = cfg or MenuCfg()

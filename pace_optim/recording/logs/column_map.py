@@ -152,11 +152,7 @@ def _check_keys(path: Path, where: str, content: Mapping[str, Any], known: tuple
 
 
 def write_map(path: Path, columns: ColumnMap, comments: tuple[str, ...] = ()) -> None:
-    """Write a map that reads back the same.
-
-    Args:
-        comments: Lines for its head.
-    """
+    """Write a map that reads back the same."""
     text = map_text(columns, comments)
     write_atomically(path, lambda file: file.write(text.encode()))
 

@@ -24,9 +24,8 @@ from .column_map import ColumnMap, Source, map_text, printable, write_map
 from .guess import Robot, guess_map
 from .log import Channel, Log
 from .rosbag import read_rosbag
-from .tables import is_joint_table, read_csv_log, read_parquet_log
-from .text_table import SUFFIXES as TABLES
-from .text_table import Head, head_of
+from .tables import SUFFIXES as TABLES
+from .tables import Head, head_of, is_joint_table, read_csv_log, read_parquet_log
 
 BAGS = (".mcap", ".db3", ".bag")
 LOG_SUFFIXES = (*BAGS, ".parquet", *(each for each in TABLES if each not in SUFFIXES))
@@ -59,7 +58,6 @@ def load_recordings(
             folder of a LeRobot dataset, a .csv with any names, or CSV files of one log joined by `+`.
         robot: The robot's joints and limits; without it, the log's own names are kept.
         columns: Which column is what; without it, it is guessed.
-        tell: Gets what a guess understood.
     """
     path = Path(path)
     if not is_log(path, columns):
@@ -375,7 +373,6 @@ def unused(log: Log, columns: ColumnMap, facts_from: Collection[str] = ()) -> st
     """The channels that no series comes from, in a sentence; a topic of which nothing is used as one.
 
     Args:
-        columns: What is used of it.
         facts_from: Channels that facts were read from.
     """
     used = {source.channel for by in columns.joints.values() for source in by.values()}

@@ -12,8 +12,7 @@ import numpy as np
 
 from pace_actuators.memory import check_memory
 
-from .log import Channel, Log, cleaned
-from .optional import reader
+from .log import Channel, Log, cleaned, reader
 
 _CLOCKS_AGREE = 0.5
 """Header stamps further than this from the instants of arrival are of another clock [s]."""

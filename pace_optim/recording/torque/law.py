@@ -74,8 +74,6 @@ class Table:
         It is made of the samples as they were logged, which belong to the torques that came with them.
 
         Args:
-            recording: On the control grid.
-            j: Column of the joint.
             longest_delay: Longest delay of commands [control steps].
             phase: When the drive runs, once a control step, of a log that does not sample it [control steps].
             shift: By how much later its position and speed are taken [control steps].
@@ -469,7 +467,6 @@ def _best_lags(table: Table, below: np.ndarray, of_their_own: bool = True) -> _F
     No command is newer than the position that it is compared with, and no speed, which is made of positions, is newer.
 
     Args:
-        table: Torque and its causes.
         below: Samples that may be below a limit, (K,) bool.
         of_their_own: Whether position and speed may be of different age.
     """

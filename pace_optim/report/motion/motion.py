@@ -55,7 +55,6 @@ def motions_of(
 
     Args:
         joint_names: The n joints that were measured.
-        recordings: With columns in that order.
         encoder_bias: What an encoder shows beyond the joint's position, (n,) [rad or m].
     """
     driven = DrivenJoints.of_model(model, joint_names)

@@ -6,8 +6,7 @@ import torch
 from pace_envs import ManagerBasedRLEnv, load_env_cfg
 from pace_envs.rl import RunSettings, load_cfg, train
 from pace_envs.rl.playing import PlaySettings, play
-from pace_envs.tasks.reach.reach_env_cfg import COMMAND
-from pace_envs.tasks.reach.terms import closeness, distance, site_position, to_command
+from pace_envs.tasks.reach.reach_env_cfg import COMMAND, closeness, distance, site_position, to_command
 
 TASK = "Pace-SO101-Reach-v0"
 WHERE = {"command_name": COMMAND, "site": "gripper_frame"}

@@ -17,7 +17,8 @@ from pace_envs.from_model import cfg_from_model
 from pace_envs.identified import load_identified_cfg
 from pace_envs.task_source import EnvironmentRecord
 from pace_optim.export import export
-from pace_optim.export.mjcf import model_of, write_drives
+from pace_optim.export.mjcf import model_of
+from pace_optim.export.mjcf_drives import write_drives
 from pace_optim.export.plain_drive import PlainDrive
 from pace_optim.problem.parameter_space import ParameterSpace
 
