@@ -23,7 +23,7 @@ from pace_optim.diagnosis import DiagnosisSettings, diagnose
 from pace_optim.identification.fit import fit
 from pace_optim.report import write_report
 from pace_optim.report.plots import plot_trajectories
-from pace_optim.run.find import find_run
+from pace_optim.run.open import find_run
 from pace_optim.run.result import FitResult
 from pace_optim.run.settings import OPTIMIZERS, FitSettings
 from pace_optim.run.summary import summary

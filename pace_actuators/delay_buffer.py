@@ -79,8 +79,6 @@ class DelayBuffer(Part):
 
         Args:
             max_delay: Largest lag that can be set [steps].
-            num_envs: Number of environments.
-            device: Device of the signal.
             interpolation: ``"linear"`` or ``"hold"``.
             parts: Into how many parts a step is divided.
             counts_on_device: Whether the place in the ring is a tensor; ``None`` for a GPU's alone.

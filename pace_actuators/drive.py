@@ -72,11 +72,8 @@ class Drive(Part):
         """Create the drive of a group of joints.
 
         Args:
-            cfg: The configuration.
             joint_names: Names of the joints of the group, in order.
             joint_ids: Their indices in the articulation (kept for the caller).
-            num_envs: Number of environments.
-            device: Device of all tensors.
             stiffness: Used where the configuration says ``None``; so are the following arguments.
             damping: [N m s/rad].
             armature: [kg m^2].

@@ -39,9 +39,6 @@ class DriveDelays(Part):
         Args:
             names: Of the signals that are delayed; all others pass.
             max_delay: Largest delay [control steps].
-            num_envs: Number of environments.
-            device: Device of the signals.
-            interpolation: Of the delay between samples.
             runs: Runs of the controller in a control step.
             parts: Calls of the drive from one run to the next.
         """
@@ -56,11 +53,7 @@ class DriveDelays(Part):
         return next(iter(self.buffers.values())).time_lags / self._runs
 
     def set_time_lag(self, delay: torch.Tensor | float, env_ids: EnvIds = None) -> None:
-        """Set the delay of all or some environments [control steps].
-
-        Raises:
-            ValueError: If one lies outside 0 to the largest.
-        """
+        """Set the delay of all or some environments [control steps]."""
         lag = torch.as_tensor(delay, dtype=torch.float64) * self._runs
         for buffer in self.buffers.values():
             buffer.set_time_lag(lag, env_ids)

@@ -166,11 +166,7 @@ class DriveResult:
 
 
 def result_path(path: str | Path) -> Path:
-    """Where the result of a run lies: the file itself, or that of the run's folder.
-
-    Raises:
-        ValueError: If it does not exist.
-    """
+    """Where the result of a run lies: the file itself, or that of the run's folder."""
     path = Path(path)
     with contextlib.suppress(OSError, ValueError):  # file_at says what is wrong
         path = path / "result.json" if path.is_dir() else path

@@ -12,15 +12,18 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pace_actuators.base_parameters import PER_JOINT
+import torch
+
+from pace_actuators.base_parameters import BASE_PARAMETERS, PER_JOINT
 from pace_actuators.drive_result import ALL, CURE, CommandTiming, DriveResult, LinkInertia, result_path
-from pace_actuators.effects import EffectCfg, use_recorded_effects
+from pace_actuators.effects import EffectCfg, get_effect, use_recorded_effects
 from pace_actuators.files import refuse
 from pace_actuators.joint_values import match_names
 from pace_actuators.own_code import checked_record
 
 if TYPE_CHECKING:
     from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
+
 
 LIMITS = ("effort_limit", "saturation_effort", "velocity_limit")
 DRIVE_FIELDS = ("stiffness", "damping", *LIMITS)
@@ -116,11 +119,7 @@ class IdentifiedDrives:
         """
         path = result_path(path)
         content = DriveResult.load(path)
-        try:
-            code = checked_record(content.environment)
-        except TypeError as error:
-            refuse(path, str(error), CURE)
-        use_recorded_effects(content.effects, code, str(path))
+        use_recorded_effects(content.effects, checked_record(content.environment, path, CURE), str(path))
         result = cls(
             path=path,
             task=content.task,
@@ -199,11 +198,7 @@ class IdentifiedDrives:
         return fields | self._rate_of(joints)
 
     def _rate_of(self, joints: Sequence[str]) -> dict[str, Any]:
-        """How the controllers of some joints ran: the same torque law needs the same rate.
-
-        Raises:
-            ValueError: If they ran differently.
-        """
+        """How the controllers of some joints ran: the same torque law needs the same rate."""
         names = ("drive_dt", *RATE_FLAGS)
         rates = {tuple(self.drive.get(name, {}).get(joint) for name in names) for joint in joints}
         if len(rates) > 1:
@@ -245,11 +240,7 @@ def delay_in_steps(cfg: PaceDCMotorCfg, physics_dt: float | None) -> tuple[float
     """Delay and largest delay of a drive [control steps].
 
     Args:
-        cfg: The drive.
         physics_dt: Time between two of its calls [s].
-
-    Raises:
-        ValueError: If the delay is given in seconds, and the time of a step is not known.
     """
     if cfg.delay_s is None:
         return (cfg.max_delay or 0.0) if cfg.delay is None else cfg.delay, cfg.largest_delay
@@ -266,7 +257,6 @@ def step_notes(cfg: PaceDCMotorCfg, physics_dt: float | None) -> list[str]:
     """What the time steps of a drive change about values that were identified with others, in words.
 
     Args:
-        cfg: The drive.
         physics_dt: Time between two of its calls [s]; ``None`` says nothing.
     """
     if cfg.identified is None or physics_dt is None:
@@ -312,3 +302,83 @@ def _by_pattern(values: Mapping[str, float]) -> dict[str, float] | float:
     """By regular expression of the joint; one number where all are alike."""
     alike = set(values.values())
     return alike.pop() if len(alike) == 1 else {re.escape(joint): value for joint, value in values.items()}
+
+
+_DRAWS_END = 3.0
+"""Standard deviations at which draws end."""
+
+
+def labels_with_std(drives: IdentifiedDrives) -> list[tuple[str, str]]:
+    """Parameters and joints (or ``"all"``) that have an error bar, in order."""
+    names = set(BASE_PARAMETERS)
+    names |= {f"{cfg.effect_class.name}.{p.name}" for cfg in drives.effects for p in cfg.effect_class.parameters}
+    return [
+        (name, key)
+        for name, entries in drives.std.items()
+        if name in names
+        for key, std in entries.items()
+        if std is not None and math.isfinite(std) and std > 0 and math.isfinite(drives.parameters[name][key])
+    ]
+
+
+def draw(drives: IdentifiedDrives, uniform: torch.Tensor, scale: float = 1.0) -> dict[str, dict[str, torch.Tensor]]:
+    """Parameters around the identified ones: Gaussian, correlated as the fit found them, cut off at 3 deviations.
+
+    What the fit gave no error bar (at a bound, without influence) keeps its value. Nothing leaves its physical range:
+    armature, frictions and delay stay >= 0, an effect's parameters within their bounds.
+
+    Args:
+        uniform: Independent draws between 0 and 1, (n, ``len(labels_with_std(drives))``).
+
+    Returns:
+        {parameter: {joint or "all": (n,)}} of those that vary, in the units of the result (the delay in control steps
+        of the identification).
+    """
+    labels = labels_with_std(drives)
+    if not (math.isfinite(scale) and scale >= 0):
+        raise ValueError(f"The scale of the error bars is {scale}, expected a finite number >= 0.")
+    if uniform.shape[1:] != (len(labels),):
+        raise ValueError(f"uniform has shape {tuple(uniform.shape)}, expected (n, {len(labels)}).")
+    normal = math.sqrt(2) * torch.erfinv(2 * uniform.double().clamp(1e-12, 1 - 1e-12) - 1)
+    normal = (normal @ _root(_correlation(drives, labels)).T).clamp(-_DRAWS_END, _DRAWS_END)
+    result: dict[str, dict[str, torch.Tensor]] = {}
+    for i, (name, key) in enumerate(labels):
+        std = drives.std[name][key] or 0.0
+        low, high = _range(name)
+        value = drives.parameters[name][key]
+        drawn = value + scale * std * normal[:, i]
+        result.setdefault(name, {})[key] = drawn.clamp(min(low, value), max(high, value))
+    return result
+
+
+def _range(name: str) -> tuple[float, float]:
+    effect, dot, parameter = name.partition(".")
+    if dot:
+        declared = next(p for p in get_effect(effect).parameters if p.name == parameter)
+        return declared.lower, declared.upper
+    least = BASE_PARAMETERS[name].least
+    return (-math.inf if least is None else least), math.inf
+
+
+def _correlation(drives: IdentifiedDrives, labels: list[tuple[str, str]]) -> torch.Tensor:
+    """The fit's correlations of these entries; independent where it has none."""
+    result = torch.eye(len(labels), dtype=torch.float64)
+    known = {label: i for i, label in enumerate(drives.correlation.get("labels", ()))}
+    at = [known.get(f"{name}/{key}") for name, key in labels]
+    for i, row in enumerate(at):
+        for j, column in enumerate(at):
+            if i != j and row is not None and column is not None:
+                result[i, j] = drives.correlation["matrix"][row][column] or 0.0
+    return result
+
+
+def _root(correlation: torch.Tensor) -> torch.Tensor:
+    """R with R Rᵀ = C and a diagonal of ones, also where rounding has made C indefinite."""
+    values, vectors = torch.linalg.eigh(correlation)
+    root = vectors * values.clamp(min=0.0).sqrt()
+    return root / root.norm(dim=1, keepdim=True).clamp(min=1e-12)
+
+
+def in_control_steps(drives: IdentifiedDrives, delay: torch.Tensor, control_dt: float) -> torch.Tensor:
+    """A delay in the identification's control steps as control steps of ``control_dt`` [s]."""
+    return delay * (drives.at.control_dt / control_dt)

@@ -75,11 +75,7 @@ class PaceDCMotorActuator(ActuatorBase):  # type: ignore[misc]
         actuator_effort_limit: torch.Tensor | float | None = None,
         actuator_velocity_limit: torch.Tensor | float | None = None,
     ):
-        """Build the drive; the arguments are Isaac Lab's, of 2.3 and of 3.0.
-
-        Raises:
-            ValueError: If the drive's configuration is unusable, or Isaac Lab's own parameters are set beside it.
-        """
+        """Build the drive; the arguments are Isaac Lab's, of 2.3 and of 3.0."""
         own = ("stiffness", "damping", *(() if OF_CONFIGURATION else _JOINT_PARAMETERS), *_LIMITS)
         _refuse([name for name in own if getattr(cfg, name, None) is not None])
         effort_limit = effort_limit if actuator_effort_limit is None else actuator_effort_limit
@@ -145,11 +141,7 @@ class PaceDCMotorActuatorCfg(ActuatorBaseCfg):  # type: ignore[misc]
     """The drive, with ``physics_dt``, the simulation's ``dt``."""
 
     def __post_init__(self) -> None:
-        """Take over the joints; and their parameters, where Isaac Lab looks for them here.
-
-        Raises:
-            ValueError: If joint parameters are set beside the drive's, or are unknown before the joints are.
-        """
+        """Take over the joints; and their parameters, where Isaac Lab looks for them here."""
         expr = self.motor.joint_names_expr
         self.joint_names_expr = self.joint_names_expr or ([expr] if isinstance(expr, str) else list(expr))
         if not OF_CONFIGURATION:
@@ -168,9 +160,6 @@ class PaceDCMotorActuatorCfg(ActuatorBaseCfg):  # type: ignore[misc]
         """The drive that a fit identified; see :meth:`PaceDCMotorCfg.from_result`. Give ``physics_dt``.
 
         What the simulator cannot represent, or only with help, is warned of.
-
-        Raises:
-            ValueError: If the result is unusable, or an effect cannot be represented at all.
         """
         for note in check_representable(IdentifiedDrives.load(path), ISAACLAB):
             warnings.warn(note, stacklevel=2)
@@ -187,9 +176,6 @@ def joint_parameters(motor: PaceDCMotorCfg) -> dict[str, Any]:
     Returns:
         ``armature`` [kg m²], ``friction`` and ``dynamic_friction`` [N m], ``viscous_friction`` [N m s/rad]; those that
         the drive says nothing of are left out.
-
-    Raises:
-        ValueError: If values are one per joint, or an effect changes the inertia, and the joints are not named.
     """
     names = _literal_names(motor.joint_names_expr)
     known = {name: value for name in CARRIED if (value := getattr(motor, name)) is not None}

@@ -16,7 +16,6 @@ def match_names(patterns: str | Sequence[str], names: Sequence[str], *, what: st
 
     Args:
         patterns: One regular expression or several.
-        names: The names to search.
         what: What the names are called in messages.
 
     Returns:
@@ -53,7 +52,6 @@ def resolve_joint_values(
 
     Args:
         value: A number (all joints), a dict of regular expression to number, or one number per joint.
-        joint_names: The joints, in order.
         field: The configuration field, for messages.
         default: The value of joints that no pattern of a dict covers; ``None`` makes that an error.
         dtype: Type of the result.

@@ -17,9 +17,6 @@ def check_memory(needed: float, what: str, cure: str) -> None:
         needed: Memory that it will take [bytes].
         what: What takes it, as the beginning of a sentence.
         cure: What to ask for instead, a sentence.
-
-    Raises:
-        ValueError: If there is less; the message says how much it would take and how much there is.
     """
     free = available_memory()
     if needed > _HEADROOM * free:

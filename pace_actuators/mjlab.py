@@ -57,11 +57,7 @@ class PaceDCMotorActuatorCfg(ActuatorCfg):  # type: ignore[misc]
     """Impedance of the joints' Coulomb friction, as in identification."""
 
     def __post_init__(self) -> None:
-        """Take over the joints; refuse what would act twice.
-
-        Raises:
-            ValueError: If mjlab's own joint parameters or delay are set beside the drive's.
-        """
+        """Take over the joints; refuse what would act twice."""
         expr = self.motor.joint_names_expr
         self.target_names_expr = self.target_names_expr or ((expr,) if isinstance(expr, str) else tuple(expr))
         super().__post_init__()
@@ -79,9 +75,6 @@ class PaceDCMotorActuatorCfg(ActuatorCfg):  # type: ignore[misc]
         """The drive that a fit identified; see :meth:`PaceDCMotorCfg.from_result`.
 
         What the simulator cannot represent, or only with help, is warned of.
-
-        Raises:
-            ValueError: If the result is unusable, or an effect cannot be represented at all.
         """
         for note in check_representable(IdentifiedDrives.load(path), MJLAB):
             warnings.warn(note, stacklevel=2)

@@ -3,16 +3,19 @@
 A name in a file alone imports nothing. A record, in a run's ``settings.json`` and ``result.json``, has the path and the
 SHA-256 of each file of the code. The bytes that were compared are the ones that run: neither another file of that name
 nor a stale byte code can take their place. The code must also have been named on this machine before
-(:mod:`pace_actuators.trusted_code`), because a foreign folder can bring both code and its digest.
+(:func:`is_trusted`), because a foreign folder can bring both code and its digest. Digests of what was named are kept in
+``$XDG_STATE_HOME/pace`` (``~/.local/state/pace``), if that folder is the user's alone; else code is named each time.
 """
 
 from __future__ import annotations
 
 import ast
+import contextlib
 import hashlib
 import os
+import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
@@ -21,8 +24,40 @@ from pathlib import Path
 from types import CodeType, ModuleType
 from typing import Any
 
-from pace_actuators.files import file_at
-from pace_actuators.trusted_code import is_trusted, trust
+from pace_actuators.files import OwnFolder, file_at, refuse
+
+_FILE = "named_code.txt"
+
+
+def trust(digests: Iterable[str]) -> None:
+    """Remember code that was named here; where nothing can be kept, it must be named each time.
+
+    Args:
+        digests: SHA-256 of its files.
+    """
+    if (folder := _folder()) is None:
+        return
+    with contextlib.suppress(OSError), folder.alone():
+        kept = _kept(folder)
+        if new := set(digests) - kept:
+            folder.write(_FILE, "".join(f"{digest}\n" for digest in sorted(kept | new)).encode())
+
+
+def is_trusted(digest: str) -> bool:
+    """Whether code of this SHA-256 has been named here before."""
+    folder = _folder()
+    return folder is not None and digest in _kept(folder)
+
+
+def _kept(folder: OwnFolder) -> set[str]:
+    text = (folder.read(_FILE) or b"").decode("ascii", errors="replace")
+    return set(re.findall(r"^[0-9a-f]{64}$", text, re.MULTILINE))
+
+
+def _folder() -> OwnFolder | None:
+    """Where they are kept: outside of every folder of runs."""
+    return OwnFolder.below("XDG_STATE_HOME", ".local/state", "pace")
+
 
 CodeRecord = Mapping[str, Mapping[str, str]]
 """``{module: {"file": path, "sha256": digest}}``, each file of a user's code."""
@@ -67,11 +102,7 @@ def _is_at(module: ModuleType, own: os.stat_result) -> bool:
 
 
 def import_named(module: str) -> ModuleType:
-    """Import a module that the user names, as ``package.module`` or as a file; it may lie in the present folder.
-
-    Raises:
-        ValueError: If it cannot be imported.
-    """
+    """Import a module that the user names, as ``package.module`` or as a file; it may lie in the present folder."""
     recorded = [finder for finder in sys.meta_path if isinstance(finder, _RecordedCode)]
     for finder in recorded:  # what the user names comes before what records name
         sys.meta_path.remove(finder)
@@ -92,13 +123,8 @@ def import_recorded(module: str, code: CodeRecord, where: str, hint: str) -> Mod
     """Import a module that a file names, if its code is what the file's record says.
 
     Args:
-        module: Its name or its file.
-        code: The record.
         where: The file that names it, for messages.
         hint: What the user types to name it himself.
-
-    Raises:
-        ValueError: If the record does not hold it, or the code has changed or gone.
     """
     name = next((n for n, entry in code.items() if entry["file"] == module), module)
     known = loaded_module(module)
@@ -141,18 +167,14 @@ def code_of(modules: Sequence[str]) -> dict[str, dict[str, str]]:
     return dict(sorted(record.items()))
 
 
-def checked_record(content: Mapping[str, Any]) -> CodeRecord:
-    """The record of the code in a file's ``environment``.
-
-    Raises:
-        TypeError: If it is another type.
-    """
+def checked_record(content: Mapping[str, Any], source: object, cure: str) -> CodeRecord:
+    """The record of the code in a file's ``environment``."""
     code = content.get("code", {})
     if not isinstance(code, Mapping) or not all(
         isinstance(entry, Mapping) and all(isinstance(entry.get(key), str) for key in ("file", "sha256"))
         for entry in code.values()
     ):
-        raise TypeError("environment.code is no record of files and digests")
+        refuse(source, "environment.code is no record of files and digests", cure)
     return code
 
 

@@ -131,11 +131,7 @@ class PaceDCMotorCfg(Config):
     """Time steps of the identification that the values come from: the drive warns where its own are too different."""
 
     def __post_init__(self) -> None:
-        """Take over the friction at rest and while sliding.
-
-        Raises:
-            ValueError: If two of them contradict each other.
-        """
+        """Take over the friction at rest and while sliding."""
         if self.static_friction is not None:
             if self.friction is not None and self.friction != self.static_friction:
                 raise ValueError(
@@ -159,7 +155,6 @@ class PaceDCMotorCfg(Config):
 
         Args:
             joint_names: All joints of the robot, in order.
-            chosen: Those wanted.
         """
         found = {i for indices in match_names(self.joint_names_expr, joint_names) for i in indices}
         group = [name for i, name in enumerate(joint_names) if i in found]
@@ -197,11 +192,7 @@ class PaceDCMotorCfg(Config):
 
 
 def _friction_ratio(static: JointValue | None, dynamic: JointValue) -> JointValue:
-    """The sliding friction's part of that at rest, per joint as the two are.
-
-    Raises:
-        ValueError: If there is no friction at rest, it is the smaller one, or the two name different joints.
-    """
+    """The sliding friction's part of that at rest, per joint as the two are."""
     if static is None:
         raise ValueError(
             f"dynamic_friction is {dynamic}, and there is no friction at rest. Give friction (static_friction) too."
@@ -241,15 +232,11 @@ def calls_per_run(cfg: PaceDCMotorCfg, physics_dt: float | None) -> int | None:
     """Calls of a drive (physics steps) from one run of its controller to the next.
 
     Args:
-        cfg: The drive.
         physics_dt: Time between two of its calls [s].
 
     Returns:
         The calls; ``None`` where runs do not fall on the same calls of every control step: the drive then keeps its
         own clock.
-
-    Raises:
-        ValueError: If its own rate is higher than that of the physics, or that of the physics is not known.
     """
     if cfg.implicit:
         return 1
@@ -298,11 +285,7 @@ class DriveParameters:
         device: torch.device,
         dtype: torch.dtype,
     ):
-        """Check the choices that are no numbers.
-
-        Raises:
-            ValueError: If one of them is unknown.
-        """
+        """Check the choices that are no numbers."""
         self._cfg = cfg
         self._joint_names = list(joint_names)
         self._shape = (num_envs, len(self._joint_names))
@@ -323,11 +306,7 @@ class DriveParameters:
             )
 
     def read(self, field: str, default: torch.Tensor | float) -> torch.Tensor:
-        """A field's values; the default where the configuration says ``None``.
-
-        Raises:
-            ValueError: If a value lies outside the field's domain, or their number is wrong.
-        """
+        """A field's values; the default where the configuration says ``None``."""
         value: JointValue | None = getattr(self._cfg, field)
         if value is None:
             result = self.tensor(default, field)
@@ -341,11 +320,7 @@ class DriveParameters:
         return result
 
     def tensor(self, value: torch.Tensor | float, field: str) -> torch.Tensor:
-        """Values spread over environments and joints.
-
-        Raises:
-            ValueError: If their number is wrong.
-        """
+        """Values spread over environments and joints."""
         tensor = torch.as_tensor(value, dtype=self._dtype, device=self._device)
         try:
             return tensor.expand(self._shape).clone()

@@ -29,8 +29,7 @@ if TYPE_CHECKING:
     )
     from pace_envs.tasks.reach.reach_env_cfg import ReachEnvCfg, reach_env_cfg
     from pace_envs.tasks.velocity.options import set_drives
-    from pace_envs.tasks.velocity.rewards import velocity_rewards
-    from pace_envs.tasks.velocity.velocity_env_cfg import VelocityEnvCfg, velocity_env_cfg
+    from pace_envs.tasks.velocity.velocity_env_cfg import VelocityEnvCfg, velocity_env_cfg, velocity_rewards
 
 __all__ = [
     "ASSETS_DIR",

@@ -28,7 +28,6 @@ class Articulation(RobotState):
         """Find the robot's joints in the simulation and build its drives.
 
         Args:
-            cfg: The configuration.
             sim: The simulation that holds the robot.
 
         Raises:
@@ -110,9 +109,7 @@ class Articulation(RobotState):
         """Add a known point mass to bodies [kg]; effects on the model and parameters of links do not change it.
 
         Args:
-            name_keys: The bodies.
             mass: [kg].
-            env_ids: The environments.
             place: Where, in the body's frame, (3,) [m]; ``None``: at its centre of mass.
         """
         rows, (ids, _) = indices(env_ids), self.find_bodies(name_keys)
@@ -127,7 +124,6 @@ class Articulation(RobotState):
         """Write an inertial parameter of links.
 
         Args:
-            references: The links.
             name: One of :data:`~pace_envs.link_inertia.NAMES`.
             values: In its unit, (num_envs, len(references)).
         """
@@ -225,8 +221,6 @@ class Articulation(RobotState):
         """Write a parameter of an effect to the drives that have it.
 
         Args:
-            effect: Its name.
-            parameter: The parameter's name.
             values: (num_envs, len(joint_ids)), or (num_envs, 1) for one value of all those joints.
             joint_ids: The joints; ``None`` for all.
 
@@ -257,8 +251,6 @@ class Articulation(RobotState):
         """Write all parameters of an effect of a drive.
 
         Args:
-            actuator: The drive.
-            effect: One of its effects.
             values: In the order of its parameters, (rows of the effect, joints of the drive, parameters).
         """
         for parameter, value in zip(effect.parameters, values.unbind(dim=-1), strict=True):

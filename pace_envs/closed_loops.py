@@ -46,7 +46,6 @@ class ClosedLoops:
         """The loops of a model; ``None`` if no active constraint ties passive joints.
 
         Args:
-            model: The model.
             driven: Degrees of freedom whose positions are given.
         """
         passive = np.setdiff1d(np.arange(model.nv), np.asarray(driven, dtype=int))

@@ -66,11 +66,7 @@ class ContactSensor:
 
     @property
     def lin_vel_w(self) -> torch.Tensor:
-        """Velocities of the geoms' centres in the world [m/s], (num_envs, num_geoms, 3).
-
-        Raises:
-            ValueError: If the sensor does not track velocities.
-        """
+        """Velocities of the geoms' centres in the world [m/s], (num_envs, num_geoms, 3)."""
         if self._velocity is None:
             raise ValueError("This contact sensor has no velocities. Set track_velocity=True in its configuration.")
         return self._velocity
@@ -94,11 +90,7 @@ class ContactSensor:
 
 
 def add_contact_sensor(spec: mujoco.MjSpec, name: str, cfg: ContactSensorCfg) -> None:
-    """Put what a :class:`ContactSensor` reads into a model: one contact sensor per geom, then one velocity per geom.
-
-    Raises:
-        ValueError: If an expression matches nothing.
-    """
+    """Put what a :class:`ContactSensor` reads into a model: one contact sensor per geom, then one velocity per geom."""
     names = [geom.name for geom in find_geoms(spec, cfg.geom_names)]
     for geom in names:
         spec.add_sensor(

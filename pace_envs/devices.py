@@ -10,9 +10,6 @@ def find_device(name: str) -> torch.device:
 
     Args:
         name: ``"cpu"``, ``"cuda"``, ``"cuda:0"``, ``"cuda:1"``, ….
-
-    Raises:
-        ValueError: If there is no such name, or torch finds no such GPU.
     """
     try:
         device = torch.device(name)

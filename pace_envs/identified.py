@@ -12,6 +12,7 @@ from typing import Any
 import mujoco
 
 from pace_actuators import IdentifiedDrives, PaceDCMotorCfg, match_names, resolve_joint_values
+from pace_actuators.drive_result import CURE
 from pace_actuators.effects import effect_cfgs
 from pace_actuators.identified import DRIVE_FIELDS
 from pace_actuators.representable import HERE, check_representable
@@ -126,16 +127,8 @@ def doubts_of_fit(drives: IdentifiedDrives) -> list[str]:
 
 
 def load_identified_cfg(drives: IdentifiedDrives) -> Any:
-    """The configuration of the environment in which drives were identified, from the record in their result.
-
-    Raises:
-        ValueError: If it is not known, and its code has changed or gone.
-    """
-    try:
-        record = EnvironmentRecord.read(drives.environment, drives.task)
-    except TypeError as error:
-        raise ValueError(f"{drives.path} is no complete fit result ({error}). Fit again.") from None
-    return record.load_cfg(str(drives.path))
+    """The configuration of the environment in which drives were identified, from the record in their result."""
+    return EnvironmentRecord.read(drives.environment, drives.task, drives.path, CURE).load_cfg(str(drives.path))
 
 
 def set_step(cfg: ManagerBasedEnvCfg, dt: float) -> None:
@@ -144,9 +137,6 @@ def set_step(cfg: ManagerBasedEnvCfg, dt: float) -> None:
     Args:
         cfg: The environment; it is changed.
         dt: Time step [s].
-
-    Raises:
-        ValueError: If the time of an environment step is no multiple of it.
     """
     step_dt = cfg.sim.dt * cfg.decimation
     decimation = round(step_dt / dt) if dt > 0 else 0

@@ -38,12 +38,7 @@ def checked_values(value: Any, shape: tuple[int, int], what: str) -> torch.Tenso
     A number is everybody's; of a tensor, each axis is as long as wanted or 1, and (joints,) is (1, joints).
 
     Args:
-        value: What the user gives.
         shape: Number of environments and of joints.
-        what: Its name, for messages.
-
-    Raises:
-        ValueError: If it is no number and no tensor, or its shape is another.
     """
     if isinstance(value, bool | int | float):
         return value

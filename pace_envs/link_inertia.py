@@ -83,11 +83,7 @@ class Reference:
 
     @classmethod
     def of(cls, model: mujoco.MjModel, link: str, joint: str = "", names: Sequence[str] = TEN) -> Reference:
-        """A body of a compiled model.
-
-        Raises:
-            ValueError: If it has no mass.
-        """
+        """A body of a compiled model."""
         b = model.body(link).id
         mass, moments = float(model.body_mass[b]), model.body_inertia[b]
         radii = np.sqrt(np.clip(0.5 * moments.sum() - moments, 0.0, None) / mass) if mass > 0 else np.zeros(3)
@@ -153,11 +149,7 @@ class Reference:
 
 
 def write_links(spec: mujoco.MjSpec, links: Mapping[str, LinkInertia], source: object) -> None:
-    """Give bodies of a model that is to be compiled other inertial parameters.
-
-    Raises:
-        ValueError: If the model has no such body.
-    """
+    """Give bodies of a model that is to be compiled other inertial parameters."""
     names = [body.name for body in spec.bodies[1:]]
     for name, link in links.items():
         if name not in names:
@@ -183,7 +175,6 @@ class LinkInertias:
         """Nothing is written yet.
 
         Args:
-            sim: The simulation.
             joint_names: The joints, in the order of the articulation; for a motor that moves several, one of these.
         """
         self.sim = sim
@@ -200,10 +191,8 @@ class LinkInertias:
         """Add a point mass to bodies; effects and parameters do not change it.
 
         Args:
-            bodies: By index.
             mass: [kg].
             place: Where, in the body's frame, (3,) [m]; ``None``: at its centre of mass.
-            rows: The simulations.
         """
         for body in bodies:
             live = {field: self.sim.expand(field) for field in FIELDS}
@@ -224,7 +213,6 @@ class LinkInertias:
         """Write one of a link's parameters.
 
         Args:
-            reference: The link.
             name: One of :data:`NAMES`.
             values: In its unit, (num_envs,).
         """
@@ -423,13 +411,7 @@ def _rows(matrix: np.ndarray) -> tuple[tuple[float, ...], ...]:
 
 
 def moved_by(model: mujoco.MjModel, link: str, joints: Sequence[str]) -> str | None:
-    """The driven joint that moves a link: the nearest above it; ``None``: it does not move.
-
-    Args:
-        model: The robot.
-        link: A body's name.
-        joints: The driven joints.
-    """
+    """The driven joint that moves a link: the nearest above it; ``None``: it does not move."""
     b, driven = model.body(link).id, DrivenJoints.of_model(model, joints)
     while b > 0:
         own = range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b])

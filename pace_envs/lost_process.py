@@ -13,11 +13,7 @@ _OF_THE_CONNECTION = re.compile(r"gloo|nccl|connection (closed|reset|refused)|br
 
 @contextmanager
 def told_of_lost_processes() -> Iterator[None]:
-    """Say in one line that another process of a shared job is gone.
-
-    Raises:
-        ValueError: If it is.
-    """
+    """Say in one line that another process of a shared job is gone."""
     try:
         yield
     except RuntimeError as error:  # torch's errors of a backend are such, too

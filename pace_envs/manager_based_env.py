@@ -78,7 +78,6 @@ class ManagerBasedEnv(gym.Env):
         """Build the scene and the managers.
 
         Args:
-            cfg: The configuration.
             render_mode: ``None`` or ``"rgb_array"``.
 
         Raises:
@@ -227,8 +226,6 @@ class ManagerBasedEnv(gym.Env):
         """Do what a function of the environment does; on a GPU from a CUDA graph.
 
         Args:
-            name: Of the graph.
-            function: What is done.
             homes: Makes the places of what it may replace.
         """
         if self.device.type != "cuda" or not self.cfg.sim.graphs:

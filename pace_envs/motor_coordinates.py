@@ -51,11 +51,7 @@ class DrivenJoints:
         """Find the joints that drives move.
 
         Args:
-            model: The model.
             names: Joints, and motors by the names of their tendons.
-
-        Raises:
-            ValueError: If a name is not one of these, or the motors of a group do not determine its joints.
         """
         single = [model.joint(j).name for j in range(model.njnt) if int(model.jnt_type[j]) in _SINGLE]
         rows = {name: fixed_tendon(model, name) for name in names if name not in single}
@@ -71,12 +67,7 @@ class DrivenJoints:
         """The same of the rows of the motors among the names.
 
         Args:
-            names: Joints and motors.
-            rows: Of the motors.
             order: The model's joints, in its order.
-
-        Raises:
-            ValueError: If the motors of a group do not determine its joints.
         """
         joints, every = dict.fromkeys(names, ""), {**{name: {name: 1.0} for name in names}, **rows}
         for group in _groups(every):
@@ -192,10 +183,6 @@ def add_motors(spec: mujoco.MjSpec, rows: Rows, source: object) -> None:
     Args:
         spec: The model; it is changed.
         rows: How the motors turn with joints.
-        source: Its file, for messages.
-
-    Raises:
-        ValueError: If a row names a joint that the model lacks.
     """
     joints, tendons = [joint.name for joint in spec.joints], [tendon.name for tendon in spec.tendons]
     for motor, row in rows.items():
@@ -236,16 +223,11 @@ class MotorCoordinates:
         """Look up the columns.
 
         Args:
-            sim: The simulation.
-            driven: What the drives move.
             shared: Drives of a joint whose torque acts on joints that follow it too, such as a gripper's other finger,
                 {joint: {joint: ratio}}; Σ ratio q is the joint's own position where they follow. Armature and friction
                 of such a drive stay on its joint, as model files have them.
             continuous: Whether loops run continuously: the damping of such drives is that of their loops, which acts
                 on all their joints.
-
-        Raises:
-            ValueError: If a motor's joints lie on different branches of the model.
         """
         model = sim.model
         coupled = {name: joint for name, joint in zip(driven.names, driven.joints, strict=True) if name != joint}
@@ -312,7 +294,6 @@ class MotorCoordinates:
         """Positions (..., nq) or speeds (..., nv) of driven joints; those that follow do not count.
 
         Args:
-            values: As the simulation shows them.
             columns: ``places`` or ``columns``.
         """
         result, count = values.clone(), len(self._driven)

@@ -74,7 +74,6 @@ def bias_in_frame(model: mujoco.MjModel, state: FrameState, motion: np.ndarray, 
 
     Args:
         model: The model, whose base is fixed.
-        state: Of B simulations.
         motion: Of each, (B, 9): ω [rad/s], α [rad/s²], f [m/s²].
         point: Where f acts, (3,) or (B, 3) [m], in the model's world.
 

@@ -126,8 +126,6 @@ def make_env(
 
     Args:
         env_cfg_entry_point: Where its configuration comes from.
-        cfg: Your configuration instead.
-        num_envs: Number of environments.
         physics_dt: A finer physics time step under the same control rate [s].
         delay_mode: ``"command"`` or ``"effort"``, for all drives.
         seed: Seed of all random draws.

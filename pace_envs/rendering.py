@@ -10,11 +10,7 @@ _DRAWN = 2
 
 
 def drawn(model: mujoco.MjModel) -> mujoco.MjModel:
-    """The same model; bodies of which nothing would be drawn, as their meshes are left out, show all their geoms.
-
-    Args:
-        model: It is changed.
-    """
+    """The same model; bodies of which nothing would be drawn, as their meshes are left out, show all their geoms."""
     for body in range(model.nbody):
         own = model.geom_bodyid == body
         if (model.geom_group[own] > _DRAWN).all():

@@ -29,11 +29,7 @@ def load_robot_spec(cfg: ArticulationCfg, *, touches: bool = False) -> mujoco.Mj
     A file that names no others is read once: a copy takes a fiftieth of the time.
 
     Args:
-        cfg: The robot.
         touches: Whether it touches anything: meshes that collide stay, and each geom that collides has a name.
-
-    Raises:
-        ValueError: If the file is missing or no usable model, has no base that could float, or a joint cannot be held.
     """
     path = Path(cfg.mjcf_path)
     text = path.read_bytes() if path.is_file() and path.stat().st_size < _LARGEST else b""
@@ -68,11 +64,7 @@ def load_robot_spec(cfg: ArticulationCfg, *, touches: bool = False) -> mujoco.Mj
 
 
 def _of_joints(model: mujoco.MjModel, positions: Mapping[str, float]) -> dict[str, float]:
-    """Where joints are held, with those of motors in place of the motors' own positions.
-
-    Raises:
-        ValueError: If some motors of a group are held, and others are not.
-    """
+    """Where joints are held, with those of motors in place of the motors' own positions."""
     motors = [name for name in positions if fixed_tendon(model, name) is not None]
     if not motors:
         return dict(positions)
@@ -93,10 +85,6 @@ def find_geoms(spec: mujoco.MjSpec, expressions: str | tuple[str, ...]) -> list[
 
     Args:
         spec: A robot whose colliding geoms have names.
-        expressions: Regular expressions.
-
-    Raises:
-        ValueError: If an expression matches nothing.
     """
     geoms = _colliding(spec)
     owners = [geom.parent.name for geom in geoms]
@@ -145,11 +133,7 @@ def hold_joints(spec: mujoco.MjSpec, model: mujoco.MjModel, positions: Mapping[s
 
     Args:
         spec: The model; it is changed.
-        model: The same, compiled.
         positions: Where joints are held [rad, of slides m], by name.
-
-    Raises:
-        ValueError: If there is no such hinge or slide joint, or a tendon ties a held joint to another.
     """
     positions = _with_followers(model, positions)
     _delete_references(spec, {*positions}, {*_tendons_of(spec, positions)})

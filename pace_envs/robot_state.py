@@ -14,12 +14,67 @@ from pace_actuators import resolve_joint_values
 from pace_actuators.joint_units import JointType
 from pace_actuators.text import listed
 from pace_envs.articulation_cfg import ArticulationCfg
-from pace_envs.articulation_data import ArticulationData
 from pace_envs.closed_loops import ClosedLoops
 from pace_envs.indexing import EnvIds, JointIds, assign, checked_values, find_names, indices, zeros_like
 from pace_envs.motor_coordinates import DrivenJoints, MotorCoordinates, fixed_tendon, joint_ranges
-from pace_envs.quaternions import multiply, rotate_inverse
+from pace_envs.quaternions import down, multiply, rotate_inverse
 from pace_envs.simulation import Simulation
+
+
+@dataclass(kw_only=True)
+class ArticulationData:
+    """State, targets and defaults; joints in the articulation's ``joint_names`` order, of the simulation's type.
+
+    Tensors of the state may share memory with the simulation: clone them to keep them.
+    """
+
+    joint_pos: torch.Tensor
+    """True joint positions [rad], (num_envs, num_joints)."""
+    joint_vel: torch.Tensor
+    """Joint velocities [rad/s], (num_envs, num_joints)."""
+    default_joint_pos: torch.Tensor
+    """[rad], (num_envs, num_joints)."""
+    default_joint_vel: torch.Tensor
+    """[rad/s], (num_envs, num_joints)."""
+    joint_pos_limits: torch.Tensor
+    """Lower and upper [rad], (num_joints, 2); infinite without a limit."""
+    soft_joint_pos_limits: torch.Tensor
+    """Lower and upper [rad], (num_joints, 2)."""
+    joint_pos_target: torch.Tensor
+    """[rad], (num_envs, num_joints)."""
+    joint_vel_target: torch.Tensor | None = None
+    """[rad/s], (num_envs, num_joints); ``None`` until one is set, which means zero."""
+    joint_effort_target: torch.Tensor | None = None
+    """Feed-forward [N m], (num_envs, num_joints); ``None`` until one is set, which means zero."""
+    computed_torque: torch.Tensor
+    """Torque that the controllers ask for [N m], (num_envs, num_joints)."""
+    applied_torque: torch.Tensor
+    """Torque at the joints [N m], (num_envs, num_joints)."""
+    root_pos_w: torch.Tensor | None = None
+    """Position of a floating base in the world [m], (num_envs, 3); ``None`` for a fixed base."""
+    root_quat_w: torch.Tensor | None = None
+    """Orientation of a floating base, w x y z, (num_envs, 4)."""
+    root_lin_vel_w: torch.Tensor | None = None
+    """Linear velocity of a floating base in the world [m/s], (num_envs, 3)."""
+    root_ang_vel_b: torch.Tensor | None = None
+    """Angular velocity of a floating base in its frame [rad/s], (num_envs, 3)."""
+
+    @property
+    def root_lin_vel_b(self) -> torch.Tensor:
+        """Linear velocity of a floating base in its frame [m/s], (num_envs, 3)."""
+        return rotate_inverse(of_floating_base(self.root_quat_w), of_floating_base(self.root_lin_vel_w))
+
+    @property
+    def projected_gravity_b(self) -> torch.Tensor:
+        """Direction of gravity in a floating base's frame, (num_envs, 3)."""
+        return down(of_floating_base(self.root_quat_w))
+
+
+def of_floating_base(state: torch.Tensor | None) -> torch.Tensor:
+    """A part of the root's state."""
+    if state is None:
+        raise ValueError("This robot's base is fixed: it has no root state. Set fix_base=False.")
+    return state
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,13 +107,7 @@ class JointLayout:
         """Find the joints in a model.
 
         Args:
-            model: The model.
             joint_order: Their order, and motors that move several joints; ``None`` means the model's joints.
-            path: The model's file, for messages.
-            device: Device of the columns.
-
-        Raises:
-            ValueError: If the model has no joints to drive, or the order names unknown ones.
         """
         root, single = None, {}
         for j in range(model.njnt):
@@ -124,11 +173,7 @@ class RobotState:
         """Find the robot's joints in the simulation.
 
         Args:
-            cfg: The configuration.
             sim: The simulation that holds the robot.
-
-        Raises:
-            ValueError: If names in the configuration do not fit the model.
         """
         self.cfg = cfg
         self._sim = sim
@@ -228,9 +273,6 @@ class RobotState:
 
         Returns:
             Position [m] and quaternion (w, x, y, z), (num_envs, 7).
-
-        Raises:
-            ValueError: If the model has neither.
         """
         sim, model = self._sim, self._sim.model
         sites = [model.site(i).name for i in range(model.nsite)]
@@ -263,14 +305,10 @@ class RobotState:
         """Joints whose names match regular expressions.
 
         Args:
-            name_keys: One expression or several.
             preserve_order: Order by the expressions instead of by ``joint_names``.
 
         Returns:
             Indices and names.
-
-        Raises:
-            ValueError: If an expression matches no joint.
         """
         return find_names(name_keys, self.joint_names, preserve_order, "joint")
 
@@ -335,9 +373,6 @@ class RobotState:
             root_state: Position [m], quaternion (w x y z), linear velocity in the world [m/s] and angular
                 velocity in the base's frame [rad/s].
             env_ids: The environments, or ``None`` for all.
-
-        Raises:
-            ValueError: If the base is fixed.
         """
         if self._layout.root is None:
             raise ValueError("This robot's base is fixed: it has no root state to write.")

@@ -141,9 +141,6 @@ def use_rewards(cfg: TrainingEnvCfg, name: str | None) -> None:
     Args:
         cfg: The task; it is changed.
         name: Of the set; ``None`` keeps the task's own rewards, or takes the first set where it has none.
-
-    Raises:
-        ValueError: If there is no such set.
     """
     if name is None:
         cfg.rewards = cfg.rewards or next(iter(cfg.reward_sets.values()), {})

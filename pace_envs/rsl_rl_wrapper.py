@@ -24,9 +24,6 @@ class RslRlVecEnvWrapper(VecEnv):
         Args:
             env: The environment, or what ``gym.make`` returned.
             clip_actions: Actions are clipped to plus and minus this.
-
-        Raises:
-            ValueError: If the environment is of another kind.
         """
         if not isinstance(env.unwrapped, ManagerBasedRLEnv):
             raise ValueError(f"The environment is a {type(env.unwrapped).__name__}, expected a ManagerBasedRLEnv.")

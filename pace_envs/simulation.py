@@ -95,11 +95,7 @@ class SimulationCfg:
 
 
 def make_simulation(cfg: SimulationCfg, spec: mujoco.MjSpec, num_envs: int) -> Simulation:
-    """Build what the configuration asks for.
-
-    Raises:
-        ValueError: If the device or a package is missing, or a value of the configuration or the model is unusable.
-    """
+    """Build what the configuration asks for."""
     if cfg.class_type is not None:
         return cfg.class_type(cfg, spec, num_envs)
     if cfg.device == "cpu":
@@ -147,9 +143,7 @@ class Simulation:
         """Compile the model and start the thread pool.
 
         Args:
-            cfg: The configuration.
             spec: The model; it is changed: options, joint friction's solver parameters, no actuators or keys.
-            num_envs: Number of simulations.
 
         Raises:
             ValueError: If a value of the configuration or the model is unusable.
@@ -254,7 +248,6 @@ class Simulation:
         """Write what drives leave to the simulation, (num_envs, len(columns)) each; after the applied torques.
 
         Args:
-            columns: Degrees of freedom.
             armature: Rotor inertia [kg m²].
             friction: Coulomb friction [N m].
             viscous: Viscous friction [N m s/rad].
@@ -449,7 +442,6 @@ class Simulation:
         Args:
             before: Speeds before the step, (num_envs, nv).
             outcomes: What the step computed.
-            drift: Moves positions.
         """
         most, weight = self.expand("dof_frictionloss"), self.expand("dof_invweight0")
         force, free, constraints = (outcomes[name] for name in _FRICTION)
@@ -469,8 +461,6 @@ class Simulation:
         Args:
             impulse: By what each friction alone differs, (num_envs, nv); zero where none turns.
             before: Speeds before the step.
-            force: Friction in it.
-            most: Coulomb friction.
         """
         hit, change = impulse.any(dim=1).nonzero()[:, 0], torch.zeros_like(impulse)
         if not len(hit):
@@ -643,12 +633,7 @@ class Drift:
     """Moves positions with the speeds alone, as MuJoCo's ``mj_integratePos``."""
 
     def __init__(self, model: mujoco.MjModel, device: torch.device):
-        """Look up where positions and speeds are.
-
-        Args:
-            model: The model.
-            device: Of the state.
-        """
+        """Look up where positions and speeds are."""
         kinds = {name: model.jnt_type == getattr(mujoco.mjtJoint, f"mjJNT_{name}") for name in ("FREE", "BALL")}
         single = ~(kinds["FREE"] | kinds["BALL"])
         positions, speeds = model.jnt_qposadr, model.jnt_dofadr

@@ -242,11 +242,7 @@ class Copies:
     """Copies tensors that keep their addresses, again and again, each time into new memory."""
 
     def __init__(self, tensors: Sequence[torch.Tensor]):
-        """Write the kernel.
-
-        Args:
-            tensors: Contiguous ones on one GPU.
-        """
+        """Write the kernel."""
         self._tensors = [tensor for tensor in tensors if tensor.numel()]
         self._every = list(tensors)
         sizes = [tensor.numel() * tensor.element_size() for tensor in self._tensors]

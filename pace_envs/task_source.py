@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pace_actuators.files import checked
 from pace_actuators.own_code import (
     absolute_reference,
     checked_record,
@@ -17,12 +18,10 @@ from pace_actuators.own_code import (
     import_recorded,
     loaded_module,
     split_reference,
+    trust,
 )
-from pace_actuators.trusted_code import trust
 from pace_envs.model_file import is_model_file, read_model_file
 from pace_envs.registration import load_env_cfg, registered_by
-
-_ENVIRONMENT = ("task", "module", "folder", "code", "files", "control_dt", "held_joints", "motors")
 
 
 def use_task(text: str) -> str:
@@ -31,9 +30,6 @@ def use_task(text: str) -> str:
     Args:
         text: A registered name, ``module:Name``, ``path/to/file.py:Name`` (either registers the name when it is
             imported), or a model file (``.xml``, ``.mjcf``, ``.urdf``).
-
-    Raises:
-        ValueError: If there is no such module or file.
     """
     if is_model_file(text):
         if not Path(text).is_file():
@@ -83,7 +79,6 @@ class EnvironmentRecord:
 
         Args:
             task: As :func:`use_task` returns it.
-            cfg: Its configuration.
             effects: Modules of effects of the user's own.
             folder: Where relative paths begin; ``None`` means the present folder.
         """
@@ -103,37 +98,16 @@ class EnvironmentRecord:
         )
 
     @classmethod
-    def read(cls, content: Mapping[str, Any] | None, task: str) -> EnvironmentRecord:
-        """The ``environment`` of a file; that of a registered task without such a file.
-
-        Raises:
-            TypeError: If it is damaged.
-        """
+    def read(
+        cls, content: Mapping[str, Any] | None, task: str, source: object = "settings.json", cure: str = "Start again."
+    ) -> EnvironmentRecord:
+        """The ``environment`` of a file; that of a registered task without such a file."""
         if not content:
             return cls(task=task)
-        values = {key: content[key] for key in _ENVIRONMENT if key in content}
-        for key, kind in (
-            ("task", str),
-            ("module", str | None),
-            ("folder", str),
-            ("files", Mapping),
-            ("control_dt", float | None),
-            ("held_joints", Mapping),
-            ("motors", Mapping),
-        ):
-            if key in values and not isinstance(values[key], kind):
-                raise TypeError(f"environment.{key} is {values[key]!r}")
-        held = values.get("held_joints", {})
-        if not all(isinstance(place, (int, float)) for place in held.values()):
-            raise TypeError(f"environment.held_joints is {held!r}")
-        rows = values.get("motors", {})
-        if not all(
-            isinstance(row, Mapping) and all(isinstance(ratio, (int, float)) for ratio in row.values())
-            for row in rows.values()
-        ):
-            raise TypeError(f"environment.motors is {rows!r}")
-        checked_record(content)
-        return cls(**{"task": task} | values)
+        whole = {"task": task, **content} if isinstance(content, Mapping) else content
+        record = checked(cls, whole, f"{source}: environment", cure)
+        checked_record(content, source, cure)
+        return record
 
     def to_dict(self) -> dict[str, Any]:
         """For a JSON file."""
@@ -145,9 +119,6 @@ class EnvironmentRecord:
         Args:
             where: The file of this record, for messages.
             task: Another one, as :func:`use_task` returns it.
-
-        Raises:
-            ValueError: If its code has changed or gone.
         """
         if task is not None:
             return task

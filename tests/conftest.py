@@ -33,6 +33,12 @@ def warm() -> Iterator[WarmPython]:
         yield python
 
 
+@pytest.fixture
+def no_export(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Trainings do not write the policy's own files, which takes ONNX seconds."""
+    monkeypatch.setattr("pace_envs.rl.training.export_policy", lambda *_: None)
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _effects_are_forgotten() -> Iterator[None]:
     """Effects that one file of tests registers are not those of the next one in the same process."""

@@ -16,13 +16,13 @@ from importlib import import_module
 from pathlib import Path
 from unittest import mock
 
+from effect_page import effect_page
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files, InclusionLevel
 from mkdocs.structure.pages import Page
 
 from pace_actuators.effects import available_effects, get_effect
 from pace_actuators.effects.effect import Effect
-from pace_actuators.effects.pages import effect_page
 from pace_optim.commands import verbs
 
 ROOT = Path(__file__).parents[2]

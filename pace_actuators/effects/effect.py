@@ -231,7 +231,6 @@ class Effect(Part):
             control_dt: Time between two runs of the controller [s].
             delay_mode: What the drive's own delay delays.
             rows: Which environments it acts on.
-            device: Device of all tensors.
             dtype: Type of all tensors.
         """
         self.rows = rows

@@ -80,11 +80,7 @@ class EffectCfg:
 
 
 def effect_cfgs(effects: Sequence[EffectCfg | str]) -> list[EffectCfg]:
-    """Configurations of effects given by text or as such.
-
-    Raises:
-        ValueError: If one is unknown, or given twice for the same environments.
-    """
+    """Configurations of effects given by text or as such."""
     cfgs = [EffectCfg.parse(effect) if isinstance(effect, str) else effect for effect in effects]
     names = [(cfg.effect_class.name, str(cfg.env_rows)) for cfg in cfgs]
     repeated = sorted({name for name, rows in names if names.count((name, rows)) > 1})

@@ -68,11 +68,7 @@ class FreeForm(Effect):
 
     @classmethod
     def curve(cls, values: Mapping[str, float]) -> dict[str, list[float]]:
-        """Where the knots are, and the curve there [N m], or the part by which it changes what it multiplies.
-
-        Args:
-            values: By parameter.
-        """
+        """Where the knots are, and the curve there [N m], or the part by which it changes what it multiplies."""
         own = [values[name] for name in cls._names()]
         center, reach = values.get("center", 0.0), values["reach"]
         return {

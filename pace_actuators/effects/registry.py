@@ -62,9 +62,6 @@ def import_effect(text: str) -> str:
     Args:
         text: What :meth:`EffectCfg.parse` reads, with ``module:Class`` or ``path/to/file.py:Class`` for the name; a
             registered name is returned as it is.
-
-    Raises:
-        ValueError: If there is no such module or class.
     """
     name, at, joints = text.partition("@")
     module, _ = split_reference(name)
@@ -84,11 +81,6 @@ def use_recorded_effects(effects: Sequence[str], code: CodeRecord, where: str) -
 
     Args:
         effects: What :meth:`EffectCfg.parse` reads.
-        code: The record.
-        where: The file, for messages.
-
-    Raises:
-        ValueError: If code is named that the record does not hold, or that has changed since.
     """
     for text in effects:
         if module := split_reference(text.partition("@")[0])[0]:

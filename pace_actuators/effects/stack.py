@@ -55,17 +55,10 @@ class EffectStack(Part):
         """Build the effects.
 
         Args:
-            cfgs: Which, on which joints.
-            joint_names: The drive's joints.
-            num_envs: Number of environments.
             dt: Time between two calls of the drive [s].
             control_dt: Time between two runs of the controller [s].
             delay_mode: What the drive's own delay delays.
-            device: Device of all tensors.
             dtype: Type of all tensors.
-
-        Raises:
-            ValueError: If joints or values do not fit.
         """
         self.state = DriveState.zeros(num_envs, len(joint_names), device, dtype)
         self.state.enabled.fill_(1.0)
@@ -133,11 +126,7 @@ class EffectStack(Part):
         return stack
 
     def find(self, name: str) -> Effect:
-        """The effect of that name.
-
-        Raises:
-            ValueError: If the drive does not have it.
-        """
+        """The effect of that name."""
         for effect in self.effects:
             if effect.name == name:
                 return effect

@@ -351,7 +351,6 @@ def join_couplings(effects: Sequence[Effect], num_envs: int) -> None:
 
     Args:
         effects: Of one drive, prepared.
-        num_envs: Number of environments.
     """
     couplings = [effect for effect in effects if isinstance(effect, _TwoMass)]
     for leading in (effect for effect in couplings if isinstance(effect, Backlash)):

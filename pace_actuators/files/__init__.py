@@ -1,11 +1,11 @@
 """Read files, with errors that name file and key; write them completely or not at all."""
 
-from pace_actuators.files.keeping import refuse_place, refuse_taken
 from pace_actuators.files.own_folder import OwnFolder
-from pace_actuators.files.reading import file_at, parsed_json, read_json, read_tensors
-from pace_actuators.files.schema import checked, refuse
+from pace_actuators.files.reading import checked, file_at, parsed_json, read_json, read_tensors, refuse
 from pace_actuators.files.writing import (
     json_text,
+    refuse_place,
+    refuse_taken,
     remove_leftovers,
     replacing,
     write_atomically,

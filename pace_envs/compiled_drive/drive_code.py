@@ -48,9 +48,7 @@ class DriveCode(Names):
         """Find what is needed.
 
         Args:
-            program: What is done.
             own: Before the names of what is kept from part to part; it is declared there, else by :meth:`begin`.
-            prefix: Before the names of tables.
         """
         self._program, self._own, self._prefix = program, own, prefix
         self.tape = tape = program.tape
@@ -109,7 +107,6 @@ class DriveCode(Names):
         """What a part does.
 
         Args:
-            part: Its number.
             special: Writes what series and MuJoCo's fields are, and what MuJoCo is given.
             shown: Writes what is shown, in the first part.
         """

@@ -31,9 +31,6 @@ def joint_source(program: Program) -> tuple[str, list[int]]:
     The function ``simulate`` goes through the control steps ``first`` to ``last`` of ``count`` joints. What is shown
     at step k is written to ``out[slot[k] * count + e]`` unless the slot is negative; series are read at ``place[e]`` of
     ``stride`` numbers.
-
-    Args:
-        program: What one control step does.
     """
     code = DriveCode(program)
     count, size = len(program.tape.series), "(long long)steps * stride"

@@ -18,8 +18,7 @@ from pace_actuators.effects.drive_state import DriveState
 from pace_actuators.part import Part
 from pace_envs.compiled_drive.drive_code import Program, Read
 from pace_envs.compiler.operations import COMPARED, TYPES, UNARY, rule
-from pace_envs.compiler.tape import Node, NotTraceableError, Tape
-from pace_envs.compiler.tracer import Tracer, tensors_in
+from pace_envs.compiler.tape import Node, NotTraceableError, Tape, Tracer, tensors_in
 from pace_envs.mdp import JointPositionAction
 
 if TYPE_CHECKING:
@@ -236,9 +235,7 @@ class TracedDelay(DelayBuffer):
         """Stand for a delay.
 
         Args:
-            tracer: Notes.
             lag: Makes what stands for it, in steps, the lead included.
-            like: The delay.
         """
         self.interpolation, self.parts, self._length = like.interpolation, like.parts, like._length
         self._tracer, self._make_lag = tracer, lag
@@ -278,7 +275,6 @@ class OneJoint:
 
         Args:
             robot: Whose drive it is; it has made a control step: what happens only in the first one is not noted.
-            actuator: The drive.
             rows: Environments, in all of which the same effects act.
         """
         self.tracer = JointTracer()
@@ -342,7 +338,6 @@ class OneJoint:
 
         Args:
             decimation: Physics steps of a control step.
-            commands: What the robot follows.
             with_torques: Whether the motor's torque is shown, too.
             hold: Puts the joint where it is held, with :meth:`held`; ``None``: it is free.
 
@@ -398,7 +393,6 @@ class OneJoint:
         Args:
             holder: The copy's attributes, or a dictionary.
             true: Those of which it is a copy.
-            key: The tensor's.
             begin: The environment of its first row.
             columns: The joints' in it; ``None`` where it has no others.
         """
@@ -421,7 +415,6 @@ class OneJoint:
         """What was noted.
 
         Args:
-            shown: What is shown of it.
             written: What was written into MuJoCo's fields before each physics step, and after the last.
 
         Raises:

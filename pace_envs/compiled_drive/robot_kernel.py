@@ -41,8 +41,6 @@ class CompiledRobot:
         """Nothing is recorded yet; environment c * R + r follows recording r.
 
         Args:
-            env: The environment.
-            dataset: The recordings.
             course: How bases move and joints are held; ``None``: they rest, and all joints are free.
         """
         self._env, self._dataset, self._course = env, dataset, course
@@ -62,9 +60,6 @@ class CompiledRobot:
             at: Control steps, ascending, all after the first, which has been made.
             state: Gets MuJoCo's positions and speeds at them, (len(at), num_envs, nq + nv) float64.
             torque: Gets the motors' torques at them, (len(at), num_envs, n) float64 [N m].
-
-        Raises:
-            ValueError: If MuJoCo refuses to step a robot.
         """
         kernels = None if self._refused else mujoco_kernels()
         if kernels is None:
@@ -297,11 +292,7 @@ class _Batch:
         self._state[:] = sim.batch.state
 
     def apply(self, function: int, arguments: np.ndarray) -> None:
-        """Apply a function to each environment.
-
-        Raises:
-            ValueError: If MuJoCo refuses to step one.
-        """
+        """Apply a function to each environment."""
         pointer = ctypes.c_void_p(arguments.ctypes.data)
         if self._library.mjb_apply(self._batch, None, 0, ctypes.c_void_p(function), pointer, 1):
             status = self._library.mjb_status(self._batch)

@@ -82,10 +82,8 @@ def robot_source(
     """C of all drives of a robot.
 
     Args:
-        programs: Of its drives.
         qpos: Where each joint's position is in MuJoCo's arrays, (n,).
         dof: Where its speed is, (n,).
-        num_joints: Of a recording.
         version: MuJoCo's, whose structures are used.
         coordinates: Of motors that move several joints, if any do.
     """
@@ -195,14 +193,7 @@ class _Drive:
     """Writes one drive's functions; what it keeps is one structure for each joint."""
 
     def __init__(self, number: int, program: Program, series: Sequence[str], num_joints: int):
-        """Lay out its memory.
-
-        Args:
-            number: Of the drive.
-            program: What it does.
-            series: All that there are.
-            num_joints: Of a recording.
-        """
+        """Lay out its memory."""
         self.name = f"d{number}"
         self._number, self._program, self._series, self._num_joints = number, program, series, num_joints
         self._code = DriveCode(program, "own->", f"{self.name}_")
@@ -215,7 +206,6 @@ class _Drive:
         """Its beginning, and each part of a control step that ends with a step of MuJoCo or the next control step.
 
         Args:
-            begin: Where its memory begins.
             qpos: Where each joint's position is, (n,).
             dof: Where its speed is, (n,).
         """

@@ -1,6 +1,6 @@
 """From torch's operations to C: what drives and environments do, compiled for the processor and for a GPU.
 
-Nothing is written twice. The product's own functions run while a tracer (``tracer``) takes torch's operations in place
+Nothing is written twice. The product's own functions run while a tracer (``tape``) takes torch's operations in place
 of torch, finds their C in one table (``operations``) and notes them on a tape (``tape``). There are two users:
 
 - drives over whole recordings (:mod:`pace_envs.compiled_drive`);

@@ -14,7 +14,7 @@ from pace_envs.compiler.nvrtc import Compiler, kernels_of
 from pace_envs.compiler.row_operations import on_elements, plan
 from pace_envs.compiler.row_source import SINGLE_WIDTH, Operation, kernels
 from pace_envs.compiler.rows import Array, Mode, RowSpace, elements
-from pace_envs.compiler.tracer import Tracer, tensors_in
+from pace_envs.compiler.tape import Tracer, tensors_in
 
 _ROW_WIDTH = 32
 """Threads of a block that has one for each row: few rows spread over the GPU."""
@@ -31,13 +31,7 @@ class Fusion(Tracer):
     """
 
     def __init__(self, rows: int, device: torch.device, compiler: Compiler):
-        """Prepare.
-
-        Args:
-            rows: Number of environments.
-            device: Of their tensors.
-            compiler: Compiles kernels for it.
-        """
+        """Prepare."""
         super().__init__()
         self._space, self._compiler = RowSpace(rows, device), compiler
         self._operations: list[Operation] = []

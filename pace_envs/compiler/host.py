@@ -90,9 +90,7 @@ class HostKernels:
         """Run a compiled kernel over all its joints.
 
         Args:
-            source: Its source.
             threads: Not used: ``arguments`` hold the number of joints.
-            width: Not used.
             arguments: Tensors, which are handed over by address, and whole numbers.
         """
         self._functions[source](*map(as_argument, arguments))
@@ -101,7 +99,6 @@ class HostKernels:
         """Whether a source is compiled before so many steps: it was before, or they are many with those before.
 
         Args:
-            source: The source.
             steps: Steps that are simulated now: of the physics for a robot, of control for single joints.
         """
         if source in self._functions or self._is_kept(self._name_of(source)):

@@ -44,8 +44,6 @@ class Kernels:
 
         Args:
             source: Of a compiled kernel, whose function is called ``simulate``.
-            threads: How many are wanted.
-            width: Threads of a block.
             arguments: Tensors, which are handed over by address, and whole numbers.
         """
         values = [as_argument(each) for each in arguments]
@@ -108,11 +106,7 @@ def _driver() -> ctypes.CDLL:
 
 @lru_cache(maxsize=1)
 def _compiler() -> ctypes.CDLL:
-    """NVRTC: the one in torch's own packages, or the system's.
-
-    Raises:
-        ValueError: If NVRTC is not found.
-    """
+    """NVRTC: the one in torch's own packages, or the system's."""
     version = (torch.version.cuda or "").split(".")[0]
     packages = Path(torch.__file__).parents[1] / "nvidia"
     own = [path for path in glob.glob(f"{packages}/*/lib/libnvrtc.so*") if ".alt." not in path]

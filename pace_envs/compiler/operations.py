@@ -107,14 +107,7 @@ def literal(value: float, kind: str) -> str:
 
 
 def rule(name: str, arguments: Sequence[Any], options: dict[str, Any], dtype: torch.dtype) -> Rule | None:
-    """What an operation on elements makes of its operands; ``None`` for another operation.
-
-    Args:
-        name: Of the operation, without underscore.
-        arguments: Its arguments, tensors and numbers.
-        options: By name.
-        dtype: Type of the result.
-    """
+    """What an operation on elements makes of its operands; ``None`` for another operation."""
     form, is_real = _FORMS.get(name), dtype.is_floating_point
     if name in _OF_REAL and not is_real:
         return None

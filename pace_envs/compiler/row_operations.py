@@ -27,10 +27,7 @@ def plan(space: RowSpace, func: Any, name: str, args: tuple, kwargs: dict[str, A
     """The result of an operation and how a kernel makes it; ``None`` where it is left to torch.
 
     Args:
-        space: What is known of tensors.
-        func: Torch's operation.
         name: Its name, without the underscore of those in place.
-        args: Arguments.
         kwargs: Options, without ``out``.
         target: What it writes; ``None`` for a new tensor.
     """
@@ -82,8 +79,6 @@ def _mapped(
     """Each element of a result from elements of sources.
 
     Args:
-        space: What is known of tensors.
-        result: Where it goes.
         sources: Tensors that it is made of.
         element: Makes the one at an index, 0 along the axis of rows.
         aligned: Whether sources are spread over the result as torch spreads them; else each has its own axis of rows.

@@ -21,7 +21,6 @@ class Memory:
         """Hold the memory, so that it is not reused meanwhile.
 
         Args:
-            storage: The memory.
             is_own: Whether it belongs to a deferred result, which no other tensor shares.
         """
         self.storage, self.is_own = storage, is_own
@@ -101,12 +100,7 @@ class RowSpace:
     """The tensors of all rows on a device, while operations on them are put off."""
 
     def __init__(self, rows: int, device: torch.device):
-        """Know none.
-
-        Args:
-            rows: Number of environments.
-            device: Of their tensors.
-        """
+        """Know none."""
         self.rows, self.device = rows, device
         self.memories: dict[int, Memory] = {}
         self._every_row: dict[int, torch.UntypedStorage] = {}

@@ -41,14 +41,11 @@ class FileDrive:
 def read_drives(model: mujoco.MjModel) -> tuple[list[FileDrive], list[str]]:
     """The drives of a model's joints, in the order of the joints, and notes on what was not taken as it is.
 
-    With the force F = gain u + b0 + b1 L + b2 L̇ of an actuator and its length L = G q + L0, the joint feels G F: a
+    With the force F = gain u + b0 + b1 L + b2 L̇ of an actuator and its length L = G q + L0, the joint feels G F. A
     position servo has kp = -b1 G², kd = -b2 G² and the target (gain u + b0)/(-b1 G) - L0/G.
 
     Args:
         model: The compiled model, with its actuators.
-
-    Raises:
-        ValueError: If an actuator is of a kind that no drive here follows.
     """
     found: dict[str, FileDrive] = {}
     notes: list[str] = []

@@ -47,7 +47,7 @@ class JointFacts:
     effort_limit: float
     """Largest torque of its drive [N m]; infinite where the file has none."""
     effort: float
-    """The same, or what it needs at least where the file has none: the scale of all that is in torques [N m]."""
+    """The same, or what it needs at least where the file has none. It is the scale of all that is in torques [N m]."""
 
 
 _KINDS: dict[str, Kind] = {"velocity": "velocity", "effort": "effort"}
@@ -64,10 +64,7 @@ def joint_facts(
     """Read the facts of some joints.
 
     Args:
-        model: The compiled model.
         home: Its home posture, (nq,).
-        names: The joints.
-        drives: Drives by joint.
         velocity_limits: Largest speeds by joint, where known.
         command: What joints without a drive in the file are commanded by, where known.
     """

@@ -64,12 +64,8 @@ def read_robot(path: str | Path, control_dt: float = defaults.CONTROL_DT, motors
     """Read a robot from a model file.
 
     Args:
-        path: MJCF or URDF.
         control_dt: Time between two commands [s].
         motors: Motors that move several joints and that the file lacks. Its drives of these joints are left out.
-
-    Raises:
-        ValueError: If the file is missing, is no model, or has no joints that a drive could move.
     """
     file, motors = read_model_file(path), motors or {}
     add_motors(file.spec, motors, path)
@@ -105,8 +101,8 @@ def cfg_from_model(
 ) -> PaceSim2realEnvCfg:
     """The identification environment of the robot in a model file, its base held in the air.
 
-    Joints and their order, gains, limits, armature, damping, friction, ranges and the home posture are the file's;
-    bounds and motion of each joint are scaled by its effort limit and inertia. What the file does not say is assumed
+    Joints and their order, gains, limits, armature, damping, friction, ranges and the home posture are the file's.
+    Bounds and motion of each joint are scaled by its effort limit and inertia. What the file does not say is assumed
     (:mod:`pace_envs.from_model.defaults`) and listed in ``sim2real.notes``.
 
     Args:
@@ -378,8 +374,6 @@ def at_rest(model: mujoco.MjModel, posture: np.ndarray, driven: Sequence[str]) -
     stop. They fall, and are stopped where their energy is highest (dynamic relaxation), until nothing moves.
 
     Args:
-        model: The model.
-        posture: Where it begins.
         driven: Joints that are held; so is a floating base.
     """
     own = copy.copy(model)

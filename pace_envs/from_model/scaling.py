@@ -54,8 +54,8 @@ def gains(joint: JointFacts) -> tuple[float, float]:
 def runs_continuously(joints: Sequence[JointFacts], model: mujoco.MjModel, control_dt: float) -> bool:
     """Whether the drives' loops are those of the file's actuators, which MuJoCo evaluates at every step.
 
-    Loops are held at the control rate, as in PACE, where the file has no gains (no actuators, or motors), or gains with
-    a damping that is stable there and that the file's own integrator treats explicitly too.
+    Loops are held at the control rate, as in PACE, where the file has no gains (no actuators, or motors). So are
+    gains with a damping that is stable there and that the file's own integrator treats explicitly too.
     """
     if not all(has_gains(joint) for joint in joints):
         return False

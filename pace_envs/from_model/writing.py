@@ -117,15 +117,11 @@ def configuration_text(
     """The Python file of a model file's configuration.
 
     Args:
-        model: MJCF or URDF.
         output: Where the text will lie; the model is named from there.
         control_dt: Time between two commands [s]; ``None``: 2.5 ms.
 
     Returns:
         The text, the name of the task that it registers, and the configuration.
-
-    Raises:
-        ValueError: If the model cannot be used.
     """
     cfg = cfg_from_model(model, CONTROL_DT if control_dt is None else control_dt)
     sim2real, robot = cfg.sim2real, cfg.scene.robot

@@ -86,20 +86,12 @@ class ActionManager:
         return self._terms[name]
 
     def process_action(self, action: torch.Tensor) -> None:
-        """Take an action, (num_envs, total_action_dim), where either may be 1, and hand it to the terms.
-
-        Raises:
-            ValueError: If it is no tensor, or its shape is wrong (:func:`checked_values`).
-        """
+        """Take an action, (num_envs, total_action_dim), where either may be 1, and hand it to the terms."""
         self.take_action(action)
         self.process_taken()
 
     def take_action(self, action: torch.Tensor) -> None:
-        """Copy an action to where :meth:`process_taken` finds it.
-
-        Raises:
-            ValueError: If it is no tensor, or its shape is wrong (:func:`checked_values`).
-        """
+        """Copy an action to where :meth:`process_taken` finds it."""
         shape = (self.action.shape[0], self.action.shape[1])
         self._given.copy_(torch.as_tensor(checked_values(action, shape, "the action")))
 

@@ -28,11 +28,7 @@ class EventManager:
     """Runs events, mode by mode, in the order in which they were given."""
 
     def __init__(self, cfg: Any, env: ManagerBasedEnv):
-        """Resolve the terms.
-
-        Raises:
-            ValueError: If a mode is unknown or an interval is missing.
-        """
+        """Resolve the terms."""
         self._env = env
         self._terms: dict[str, list[Term[EventTermCfg]]] = {"startup": [], "reset": [], "interval": []}
         self._time_left: list[torch.Tensor] = []

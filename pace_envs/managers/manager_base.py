@@ -110,13 +110,7 @@ class Term(Generic[CfgT]):
         """Resolve scene entities, build class terms and check the arguments.
 
         Args:
-            name: Name of the term.
-            cfg: Its configuration.
-            env: The environment.
             num_args: Number of arguments that come before its params: ``env``, and for events ``env_ids``.
-
-        Raises:
-            ValueError: If an argument is missing or unknown.
         """
         self.name = name
         self.cfg = cfg
@@ -156,6 +150,32 @@ class Term(Generic[CfgT]):
         if unknown or missing:
             wrong = f"got unknown params {', '.join(unknown)}" if unknown else f"lacks {', '.join(missing)}"
             raise ValueError(f"The term {self.name!r} {wrong}. Params of its function: {', '.join(takes) or 'none'}.")
+
+
+class ManagerBase(Generic[CfgT]):
+    """A manager of terms that are functions."""
+
+    def __init__(self, cfg: Any, env: ManagerBasedEnv, *, num_args: int = 1):
+        """Resolve the terms of a dict, or of an object whose attributes are terms."""
+        self.terms: list[Term[CfgT]] = [
+            Term(name, term, env, num_args=num_args) for name, term in term_items(cfg).items()
+        ]
+
+    @property
+    def active_terms(self) -> Any:
+        """Names of the terms."""
+        return [term.name for term in self.terms]
+
+    @property
+    def takes_masks(self) -> bool:
+        """Whether a reset of environments that are not counted does what :meth:`reset` does."""
+        return not any(term.keeps_state for term in self.terms)
+
+    def reset(self, env_ids: torch.Tensor) -> dict[str, Number]:
+        """Reset class terms; returns numbers to log."""
+        for term in self.terms:
+            term.reset(env_ids)
+        return {}
 
 
 def term_items(cfg: Any) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from pace_envs.managers.manager_base import ManagerTermBaseCfg, Term, term_items
+from pace_envs.managers.manager_base import ManagerBase, ManagerTermBaseCfg, Term, term_items
 
 if TYPE_CHECKING:
     from pace_envs.manager_based_env import ManagerBasedEnv
@@ -49,7 +49,7 @@ class ObservationGroupCfg:
     """Whether noise is added."""
 
 
-class ObservationManager:
+class ObservationManager(ManagerBase[ObservationTermCfg]):
     """Computes every group: a dict of name to tensor (num_envs, dim), float32."""
 
     def __init__(self, cfg: Any, env: ManagerBasedEnv):
@@ -59,6 +59,7 @@ class ObservationManager:
             name: (group, [Term(key, term, env) for key, term in term_items(group.terms).items()])
             for name, group in term_items(cfg).items()
         }
+        self.terms = [term for _, terms in self._groups.values() for term in terms]
         self.group_obs_dim = {name: tuple(obs.shape[1:]) for name, obs in self.compute().items()}
 
     @property
@@ -70,16 +71,6 @@ class ObservationManager:
     def constants(self) -> tuple[bool, ...]:
         """Flags that a captured step repeats: whether noise is added, by group."""
         return tuple(group.enable_corruption for group, _ in self._groups.values())
-
-    @property
-    def terms(self) -> list[Term[ObservationTermCfg]]:
-        """The terms of all groups."""
-        return [term for _, terms in self._groups.values() for term in terms]
-
-    @property
-    def takes_masks(self) -> bool:
-        """Whether no term has anything to reset."""
-        return not any(term.keeps_state for _, terms in self._groups.values() for term in terms)
 
     def group_terms(self, name: str) -> dict[str, tuple[ObservationTermCfg, int]]:
         """Configuration and size of the terms of a group, in order."""
@@ -93,12 +84,6 @@ class ObservationManager:
         """One group, (num_envs, dim), float32."""
         group, terms = self._groups[name]
         return torch.cat([self._compute_term(term, group.enable_corruption) for term in terms], dim=1).float()
-
-    def reset(self, env_ids: torch.Tensor) -> None:
-        """Reset class terms."""
-        for _, terms in self._groups.values():
-            for term in terms:
-                term.reset(env_ids)
 
     def _compute_term(self, term: Term[ObservationTermCfg], corrupt: bool) -> torch.Tensor:
         cfg, value = term.cfg, term()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from pace_envs.managers.manager_base import ManagerTermBaseCfg, Number, Term, as_number, term_items
+from pace_envs.managers.manager_base import ManagerBase, ManagerTermBaseCfg, Number, as_number
 
 if TYPE_CHECKING:
     from pace_envs.manager_based_env import ManagerBasedEnv
@@ -21,21 +21,16 @@ class RewardTermCfg(ManagerTermBaseCfg):
     """Factor of the term; 0 switches it off."""
 
 
-class RewardManager:
+class RewardManager(ManagerBase[RewardTermCfg]):
     """Sums weight * term * dt and keeps each term's sum over the episode."""
 
     def __init__(self, cfg: Any, env: ManagerBasedEnv):
         """Resolve the terms."""
-        self._terms: list[Term[RewardTermCfg]] = [Term(name, term, env) for name, term in term_items(cfg).items()]
+        super().__init__(cfg, env)
         self._reward = torch.zeros(env.num_envs, dtype=env.dtype, device=env.device)
-        self._totals = torch.zeros(len(self._terms), env.num_envs, dtype=env.dtype, device=env.device)
-        self._sums = {term.name: total for term, total in zip(self._terms, self._totals, strict=True)}
+        self._totals = torch.zeros(len(self.terms), env.num_envs, dtype=env.dtype, device=env.device)
+        self._sums = {term.name: total for term, total in zip(self.terms, self._totals, strict=True)}
         self._max_episode_length_s = getattr(env, "max_episode_length_s", 1.0)
-
-    @property
-    def active_terms(self) -> list[str]:
-        """Names of the terms."""
-        return list(self._sums)
 
     @property
     def episode_sums(self) -> dict[str, torch.Tensor]:
@@ -45,28 +40,18 @@ class RewardManager:
     @property
     def constants(self) -> tuple[float, ...]:
         """Numbers that a captured step repeats: the weights."""
-        return tuple(term.cfg.weight for term in self._terms)
-
-    @property
-    def terms(self) -> list[Term[RewardTermCfg]]:
-        """The terms."""
-        return self._terms
-
-    @property
-    def takes_masks(self) -> bool:
-        """Whether :meth:`reset_where` does what :meth:`reset` does."""
-        return not any(term.keeps_state for term in self._terms)
+        return tuple(term.cfg.weight for term in self.terms)
 
     def get_term_cfg(self, name: str) -> RewardTermCfg:
         """The configuration of a term; its weight can be changed."""
         if name not in self._sums:
             raise KeyError(f"There is no reward {name!r}. Available: {', '.join(self._sums) or 'none'}.")
-        return next(term.cfg for term in self._terms if term.name == name)
+        return next(term.cfg for term in self.terms if term.name == name)
 
     def compute(self, dt: float) -> torch.Tensor:
         """The reward of this step, (num_envs,)."""
         self._reward.zero_()
-        for term in self._terms:
+        for term in self.terms:
             weight = term.cfg.weight
             if weight != 0.0:
                 value = term() * (weight * dt)
@@ -76,7 +61,7 @@ class RewardManager:
 
     def reset_where(self, done: torch.Tensor) -> dict[str, torch.Tensor]:
         """:meth:`reset` of environments that are not counted, (num_envs,) bool; NaN if none is masked."""
-        if not self._terms:
+        if not self.terms:
             return {}
         mean = torch.where(done, self._totals, 0.0).sum(dim=1) / (done.sum() * self._max_episode_length_s)
         self._totals.masked_fill_(done, 0.0)
@@ -88,6 +73,5 @@ class RewardManager:
         for name, total in self._sums.items():
             log[f"Episode_Reward/{name}"] = as_number(total[env_ids].mean() / self._max_episode_length_s)
             total[env_ids] = 0.0
-        for term in self._terms:
-            term.reset(env_ids)
+        super().reset(env_ids)
         return log

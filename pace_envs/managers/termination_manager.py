@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from pace_envs.managers.manager_base import ManagerTermBaseCfg, Number, Term, as_number, term_items
+from pace_envs.managers.manager_base import ManagerBase, ManagerTermBaseCfg, Number, as_number
 
 if TYPE_CHECKING:
     from pace_envs.manager_based_env import ManagerBasedEnv
@@ -21,20 +21,15 @@ class TerminationTermCfg(ManagerTermBaseCfg):
     """Whether the end is a truncation (time ran out) and not a failure."""
 
 
-class TerminationManager:
+class TerminationManager(ManagerBase[TerminationTermCfg]):
     """Computes which environments are done, and why."""
 
     def __init__(self, cfg: Any, env: ManagerBasedEnv):
         """Resolve the terms."""
-        self._terms: list[Term[TerminationTermCfg]] = [Term(name, term, env) for name, term in term_items(cfg).items()]
+        super().__init__(cfg, env)
         self.terminated = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
         self.time_outs = torch.zeros_like(self.terminated)
-        self._last = {term.name: torch.zeros_like(self.terminated) for term in self._terms}
-
-    @property
-    def active_terms(self) -> list[str]:
-        """Names of the terms."""
-        return list(self._last)
+        self._last = {term.name: torch.zeros_like(self.terminated) for term in self.terms}
 
     @property
     def dones(self) -> torch.Tensor:
@@ -49,7 +44,7 @@ class TerminationManager:
         """Evaluate all terms; returns :attr:`dones`."""
         self.terminated = torch.zeros_like(self.terminated)
         self.time_outs = torch.zeros_like(self.time_outs)
-        for term in self._terms:
+        for term in self.terms:
             value = term()
             self._last[term.name] = value
             if term.cfg.time_out:
@@ -57,16 +52,6 @@ class TerminationManager:
             else:
                 self.terminated |= value
         return self.dones
-
-    @property
-    def terms(self) -> list[Term[TerminationTermCfg]]:
-        """The terms."""
-        return self._terms
-
-    @property
-    def takes_masks(self) -> bool:
-        """Whether :meth:`reset_where` does what :meth:`reset` does."""
-        return not any(term.keeps_state for term in self._terms)
 
     def reset_where(self, done: torch.Tensor) -> dict[str, torch.Tensor]:
         """:meth:`reset` of environments that are not counted, (num_envs,) bool."""
@@ -78,6 +63,5 @@ class TerminationManager:
     def reset(self, env_ids: torch.Tensor) -> dict[str, Number]:
         """Reset class terms; returns how many of these environments each term ended."""
         log = {f"Episode_Termination/{name}": as_number(last[env_ids].sum()) for name, last in self._last.items()}
-        for term in self._terms:
-            term.reset(env_ids)
+        super().reset(env_ids)
         return log

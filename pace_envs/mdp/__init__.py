@@ -10,9 +10,14 @@ from pace_envs.mdp.actions import (
 )
 from pace_envs.mdp.commands import UniformVelocityCommand, UniformVelocityCommandCfg
 from pace_envs.mdp.curriculums import command_range_by_tracking
-from pace_envs.mdp.energy import electrical_power, motor_power
-from pace_envs.mdp.events import push_by_setting_velocity, reset_joints_by_offset, reset_root_state_uniform
-from pace_envs.mdp.identified import randomize_identified_drives
+from pace_envs.mdp.events import (
+    push_by_setting_velocity,
+    randomize_body_mass,
+    randomize_friction,
+    randomize_identified_drives,
+    reset_joints_by_offset,
+    reset_root_state_uniform,
+)
 from pace_envs.mdp.observations import (
     base_ang_vel,
     base_lin_vel,
@@ -24,10 +29,10 @@ from pace_envs.mdp.observations import (
     last_action,
     projected_gravity,
 )
-from pace_envs.mdp.randomization import randomize_body_mass, randomize_friction
 from pace_envs.mdp.rewards import (
     action_rate_l2,
     ang_vel_xy_l2,
+    electrical_power,
     feet_air_time,
     feet_slide,
     flat_orientation_l2,
@@ -35,6 +40,7 @@ from pace_envs.mdp.rewards import (
     joint_acc_l2,
     joint_torques_l2,
     lin_vel_z_l2,
+    motor_power,
     track_ang_vel_z_exp,
     track_lin_vel_xy_exp,
     track_velocity_exp,

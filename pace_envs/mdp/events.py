@@ -7,11 +7,22 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from pace_actuators import IdentifiedDrives
+from pace_actuators.base_parameters import BASE_PARAMETERS
+from pace_actuators.identified import ALL, delay_in_steps, draw, in_control_steps, labels_with_std
 from pace_envs.managers import SceneEntityCfg, state_only
 from pace_envs.quaternions import from_euler, multiply
 
 if TYPE_CHECKING:
     from pace_envs.manager_based_env import ManagerBasedEnv
+
+if TYPE_CHECKING:
+    from pace_envs.manager_based_env import ManagerBasedEnv
+
+if TYPE_CHECKING:
+    from pace_envs.articulation import Articulation
+    from pace_envs.manager_based_env import ManagerBasedEnv
+
 
 _ROBOT = SceneEntityCfg()
 _AXES = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -78,3 +89,86 @@ def _draw(env: ManagerBasedEnv, count: int, ranges: Mapping[str, tuple[float, fl
         raise ValueError(f"Unknown axes {', '.join(sorted(unknown))}. Available: {', '.join(_AXES)}.")
     low, high = zip(*(ranges.get(axis, (0.0, 0.0)) for axis in _AXES), strict=True)
     return env.uniform((count, 6), env.constant(low), env.constant(high))
+
+
+def randomize_friction(
+    env: ManagerBasedEnv, env_ids: torch.Tensor, sensor_name: str, friction_range: tuple[float, float]
+) -> None:
+    """Draw one sliding friction coefficient per environment for the geoms of a contact sensor."""
+    friction = env.sim.expand("geom_friction")
+    drawn = env.uniform((len(env_ids), 1), *friction_range)
+    geoms = torch.tensor(env.scene.sensors[sensor_name].geom_ids, device=env.device)
+    friction[env_ids[:, None], geoms[None, :], 0] = drawn
+    env.sim.constants_changed()
+
+
+def randomize_body_mass(
+    env: ManagerBasedEnv, env_ids: torch.Tensor, asset_cfg: SceneEntityCfg, mass_range: tuple[float, float]
+) -> None:
+    """Add a uniform draw [kg] to the mass of bodies; their inertia grows in proportion."""
+    bodies = torch.as_tensor(asset_cfg.body_ids, device=env.device)
+    nominal = env.sim.tensor(env.sim.model.body_mass)[bodies]
+    if float(nominal.min()) + mass_range[0] <= 0.0:
+        raise ValueError(
+            f"mass_range starts at {mass_range[0]:g} kg and the lightest of these bodies has {float(nominal.min()):g} "
+            "kg, expected a positive sum. Raise the lower end or name other bodies with asset_cfg."
+        )
+    mass = nominal + env.uniform((len(env_ids), len(bodies)), *mass_range)
+    rows, columns = env_ids[:, None], bodies[None, :]
+    env.sim.expand("body_mass")[rows, columns] = mass
+    inertia = env.sim.tensor(env.sim.model.body_inertia)[bodies]
+    env.sim.expand("body_inertia")[rows, columns] = inertia * (mass / nominal)[..., None]
+    env.sim.constants_changed()
+
+
+def randomize_identified_drives(
+    env: ManagerBasedEnv,
+    env_ids: torch.Tensor,
+    drives: IdentifiedDrives,
+    scale: float = 1.0,
+    asset_cfg: SceneEntityCfg = _ROBOT,
+) -> None:
+    """Draw each environment's drives around the identified ones, by their error bars and correlations.
+
+    Args:
+        env: The environment; its robot has the identified drives.
+        scale: Multiplies the standard deviations.
+    """
+    if len(env_ids) != env.num_envs:
+        raise ValueError("randomize_identified_drives draws all environments at once: use mode 'startup'.")
+    robot = env.scene[asset_cfg.name]
+    column = {name: i for i, name in enumerate(robot.joint_names)}
+    drawn = draw(drives, env.uniform((env.num_envs, len(labels_with_std(drives)))), scale)
+    for name, entries in drawn.items():
+        joints = _joints_of(drives, name) if ALL in entries else list(entries)
+        ids = [column[joint] for joint in joints]
+        values = torch.stack([entries[ALL if ALL in entries else joint] for joint in joints], dim=1)
+        if name == "delay":
+            _write_delay(env, robot, values[:, :1], ids, drives)
+        elif name in BASE_PARAMETERS:
+            robot.write_base_parameter_to_sim(name, values, ids)
+        else:
+            effect, _, parameter = name.partition(".")
+            if effect not in robot.effects:  # left out: it is of the rig
+                continue
+            robot.write_effect_parameter_to_sim(effect, parameter, values, ids)
+
+
+def _joints_of(drives: IdentifiedDrives, name: str) -> list[str]:
+    """The joints that share a parameter."""
+    for cfg in drives.effects:
+        if cfg.effect_class.name == name.partition(".")[0]:
+            return cfg.joints(drives.joint_names)
+    return list(drives.joint_names)
+
+
+def _write_delay(
+    env: ManagerBasedEnv, robot: Articulation, values: torch.Tensor, ids: list[int], drives: IdentifiedDrives
+) -> None:
+    """Write delays of (num_envs, 1) control steps of the identification, as those of each drive."""
+    for actuator in robot.actuators.values():
+        own = [i for i in robot.joints_of(actuator) if i in ids]
+        if own:
+            dt = env.cfg.sim.dt
+            steps = in_control_steps(drives, values, dt * actuator.cfg.control_decimation)
+            robot.write_base_parameter_to_sim("delay", steps.clamp(max=delay_in_steps(actuator.cfg, dt)[1]), own)

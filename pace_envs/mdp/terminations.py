@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from pace_envs.articulation_data import of_floating_base
 from pace_envs.managers import SceneEntityCfg
+from pace_envs.robot_state import of_floating_base
 
 if TYPE_CHECKING:
     from pace_envs.manager_based_rl_env import ManagerBasedRLEnv

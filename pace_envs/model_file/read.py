@@ -55,11 +55,7 @@ def read_model_file(path: str | Path, *, touches: bool = False) -> ModelFile:
     a mass and that is missing takes its mass with it, which is noted.
 
     Args:
-        path: The file.
         touches: Whether the robot touches anything: mesh geoms that collide stay, and MuJoCo takes their convex hulls.
-
-    Raises:
-        ValueError: If the file is missing or is no model, or takes too much time or memory.
     """
     path = Path(path)
     if not path.is_file():
@@ -89,12 +85,7 @@ def compile_model(spec: mujoco.MjSpec, path: str | Path, notes: Sequence[str] = 
     """Compile a model, whose file messages name.
 
     Args:
-        spec: The model.
-        path: Its file.
         notes: What was left out of it, which may be why it cannot be compiled.
-
-    Raises:
-        ValueError: If MuJoCo cannot, or a value is not a number.
     """
     try:
         model = spec.compile()
@@ -145,16 +136,11 @@ _checked: set[tuple[str, str, int, int]] = set()
 def check_limits(path: Path, read: Callable[[], object], key: str = "") -> None:
     """Refuse a model file that takes too long, or too much memory, such as one that repeats a body 1e8 times.
 
-    MuJoCo cannot be interrupted while it reads. So the file is read in a forked process first, once; other faults of
+    MuJoCo cannot be interrupted while it reads. So the file is read in a forked process first, once. Other faults of
     the file are left to the next reader. Systems that cannot fork have no such limits.
 
     Args:
-        path: The file.
-        read: Reads, compiles and allocates it.
         key: Identifies this way of reading it.
-
-    Raises:
-        ValueError: If it is beyond a limit, or ends the process that reads it.
     """
     info = path.stat()
     state = str(path.resolve()), key, info.st_mtime_ns, info.st_size

@@ -21,7 +21,6 @@ def leave_out_meshes(spec: mujoco.MjSpec, path: Path, *, touches: bool = False) 
 
     Args:
         spec: The model; it is changed.
-        path: Its file.
         touches: Whether geoms that collide stay.
 
     Returns:
@@ -60,12 +59,7 @@ def leave_out_meshes(spec: mujoco.MjSpec, path: Path, *, touches: bool = False) 
 
 
 def missing_files(spec: mujoco.MjSpec, path: Path) -> list[str]:
-    """Files that a model names and that are not there: meshes, skins, height fields, textures.
-
-    Args:
-        spec: The model.
-        path: Its file.
-    """
+    """Files that a model names and that are not there: meshes, skins, height fields, textures."""
     files = [element.file for element in [*spec.meshes, *_surfaces(spec)] if element.file]
     return [file for file in [*files, *_cube_files(spec)] if not _exists(spec, path, file)]
 

@@ -72,12 +72,7 @@ def read_urdf(text: str, path: Path, *, touches: bool = False) -> UrdfFacts:
     """Read a URDF.
 
     Args:
-        text: Its content.
-        path: Its file.
         touches: Whether the meshes of collisions stay, under the absolute paths of their files.
-
-    Raises:
-        ValueError: If it is not a URDF, still a xacro, or a number in it is invalid.
     """
     try:
         root = ElementTree.fromstring(_with_declared_prefixes(text.strip().strip("\0")))
@@ -131,7 +126,7 @@ def _hold_what_floats(root: ElementTree.Element) -> list[str]:
 def _give_possible_inertias(root: ElementTree.Element, path: Path) -> list[str]:
     """Replace inertias that no body can have by the nearest one that a body can have; returns notes on them.
 
-    A body's second moments of mass Σ = ½ tr(I) 1 - I have no negative eigenvalue: those that have are set to 0. So no
+    A body's second moments of mass Σ = ½ tr(I) 1 - I have no negative eigenvalue. Those that have are set to 0. So no
     principal moment is larger than the sum of the others. A moving link without any mass becomes a small point.
     """
     moving = [_link(joint, "child") for joint in root.findall("joint") if _moves(joint)]

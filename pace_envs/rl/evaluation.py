@@ -9,12 +9,11 @@ import torch
 from tensordict import TensorDict
 
 from pace_actuators import resolve_joint_values
-from pace_envs.articulation_data import of_floating_base
 from pace_envs.mdp import motor_power
+from pace_envs.robot_state import of_floating_base
 from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
 from pace_envs.tasks.reach import ReachEnvCfg
-from pace_envs.tasks.reach.reach_env_cfg import COMMAND
-from pace_envs.tasks.reach.terms import distance
+from pace_envs.tasks.reach.reach_env_cfg import COMMAND, distance
 from pace_envs.tasks.velocity import VelocityEnvCfg
 
 _SETTLED = 2.0
@@ -65,12 +64,8 @@ def evaluate(
 
     Args:
         env: The environment, of a velocity task.
-        policy: Maps observations to actions.
         steps: Environment steps; by default one episode.
         on_step: Called after every step, to draw it.
-
-    Raises:
-        ValueError: If the environment is no velocity task.
     """
     base = env.unwrapped
     if not isinstance(base.cfg, VelocityEnvCfg):
@@ -129,11 +124,7 @@ class ReachEvaluation:
 def evaluate_reach(
     env: RslRlVecEnvWrapper, policy: Policy, steps: int | None = None, on_step: Callable[[], None] | None = None
 ) -> ReachEvaluation:
-    """Let a policy reach in all environments; the arguments are those of :func:`evaluate`.
-
-    Raises:
-        ValueError: If the environment is no reaching task, or no command is held for long enough.
-    """
+    """Let a policy reach in all environments; the arguments are those of :func:`evaluate`."""
     base = env.unwrapped
     if not isinstance(base.cfg, ReachEnvCfg):
         raise ValueError("This environment is no reaching task: its configuration is no ReachEnvCfg.")

@@ -33,11 +33,7 @@ from pace_envs.tasks.velocity import VelocityEnvCfg, fix_command
 
 @torch.inference_mode()
 def watch(env: RslRlVecEnvWrapper, policy: Policy) -> None:
-    """Let a policy walk in environment 0 of a window, in real time, until the window is closed.
-
-    Raises:
-        ValueError: If there is no screen.
-    """
+    """Let a policy walk in environment 0 of a window, in real time, until the window is closed."""
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ValueError("There is no screen to open a window on. Write a film with --video.")
     from mujoco import viewer
@@ -65,12 +61,7 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> N
     """Write a film: ``.mp4`` with ffmpeg, ``.gif`` with Pillow.
 
     Args:
-        path: The file.
         frames: Pictures (height, width, 3) uint8.
-        fps: Pictures per second.
-
-    Raises:
-        ValueError: If the ending is another, there are no frames, or no encoder.
     """
     path = Path(path)
     check_video_path(path)
@@ -167,11 +158,7 @@ class PlaySettings:
 
 
 def play(settings: PlaySettings, edit: EditCfg | None = None) -> Evaluation | ReachEvaluation | None:
-    """Play a policy; returns its figures, or nothing after a window was closed.
-
-    Raises:
-        ValueError: If the checkpoint or the task does not exist, or they do not fit.
-    """
+    """Play a policy; returns its figures, or nothing after a window was closed."""
     if not 0.0 < settings.seconds <= _LONGEST:
         raise ValueError(f"--seconds {settings.seconds:g}: expected more than 0, at most {_LONGEST:g}.")
     if settings.video is not None:

@@ -9,7 +9,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from pace_actuators.files import checked, read_json, refuse, write_json
+from pace_actuators.files import checked, read_json, write_json
 from pace_envs.task_source import EnvironmentRecord
 
 SETTINGS_FILE = "settings.json"
@@ -63,7 +63,6 @@ class RunSettings:
         """Write ``settings.json``, whole or not at all.
 
         Args:
-            folder: The training's.
             environment: Where the task comes from (:class:`pace_envs.task_source.EnvironmentRecord`).
         """
         write_json(folder / SETTINGS_FILE, {"version": 1, **asdict(self), "environment": dict(environment)})
@@ -73,28 +72,17 @@ class RunSettings:
         """Read ``settings.json`` and make its task known.
 
         Args:
-            folder: The training's.
             task: Another task instead of the run's.
-
-        Raises:
-            ValueError: If the folder has none, it cannot be read, or the code of its task has changed or gone.
         """
         path = folder / SETTINGS_FILE
         if not path.is_file():
             raise ValueError(f"{folder} holds no {SETTINGS_FILE}: it is not the folder of a training.")
         content = checked(cls, read_json(path, _CURE), path, _CURE)
-        record = _record(path, content.task)
+        record = EnvironmentRecord.read(read_json(path, _CURE).get("environment"), content.task, path, _CURE)
         content.task = record.use(str(path), task)
         if content.identified is not None and (folder / IDENTIFIED_FILE).is_file():
             content.identified = str(folder / IDENTIFIED_FILE)
         return content
-
-
-def _record(path: Path, task: str) -> EnvironmentRecord:
-    try:
-        return EnvironmentRecord.read(read_json(path, _CURE).get("environment"), task)
-    except (TypeError, AttributeError) as error:
-        refuse(path, str(error), _CURE)
 
 
 def new_run_folder(log_dir: str | Path, experiment_name: str) -> Path:
@@ -111,11 +99,7 @@ def new_run_folder(log_dir: str | Path, experiment_name: str) -> Path:
 
 
 def find_checkpoint(path: str | Path) -> Path:
-    """A checkpoint, or the last one of a run's folder.
-
-    Raises:
-        ValueError: If it does not exist.
-    """
+    """A checkpoint, or the last one of a run's folder."""
     path = Path(path)
     if path.is_dir():
         return latest_checkpoint(path)
@@ -125,11 +109,7 @@ def find_checkpoint(path: str | Path) -> Path:
 
 
 def latest_checkpoint(folder: Path) -> Path:
-    """The checkpoint of the last iteration.
-
-    Raises:
-        ValueError: If it does not exist.
-    """
+    """The checkpoint of the last iteration."""
     found = {int(m[1]): p for p in folder.glob("model_*.pt") if (m := re.fullmatch(r"model_(\d+)\.pt", p.name))}
     if not found:
         raise ValueError(

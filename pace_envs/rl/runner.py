@@ -70,11 +70,7 @@ class PaceOnPolicyRunner(OnPolicyRunner):
     def load(
         self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None
     ) -> dict:
-        """Load a checkpoint; training goes on with the iteration after it.
-
-        Raises:
-            ValueError: If the file is no checkpoint of these networks.
-        """
+        """Load a checkpoint; training goes on with the iteration after it."""
         if not Path(path).is_file():
             raise ValueError(f"The checkpoint {path} does not exist.")
         content = read_checkpoint(path)  # wherever it was trained
@@ -115,11 +111,7 @@ class PaceOnPolicyRunner(OnPolicyRunner):
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """The content of a checkpoint: numbers and tensors, and nothing that would run code to be read.
-
-    Raises:
-        ValueError: If the file is damaged or holds anything else.
-    """
+    """The content of a checkpoint: numbers and tensors, and nothing that would run code to be read."""
     try:
         content = read_tensors(path, _CURE)
     except ValueError as error:

@@ -51,11 +51,7 @@ def load_cfg(settings: RunSettings, edit: EditCfg | None = None) -> TrainingEnvC
     """The configuration of a training's environment.
 
     Args:
-        settings: The training.
         edit: Changes it further, such as by :func:`pace_envs.tasks.velocity.set_drives`.
-
-    Raises:
-        ValueError: If the task cannot be trained, or a setting is unusable.
     """
     cfg = load_env_cfg(settings.task)
     if not isinstance(cfg, TrainingEnvCfg):
@@ -130,10 +126,6 @@ def train(settings: RunSettings, edit: EditCfg | None = None) -> Path | None:
     """Train a policy; returns the run's folder, with checkpoints and the exported policy.
 
     Of several processes that torchrun started, the first writes it; the others return ``None``.
-
-    Args:
-        settings: The training.
-        edit: Changes the environment's configuration.
     """
     cfg = load_cfg(settings, edit)
     start = None if settings.start_from is None else find_checkpoint(settings.start_from)

@@ -37,12 +37,8 @@ def apply_test_bench_load(env: ManagerBasedEnv, env_ids: EnvIds, load: Mapping[s
     The rod of mass m_a and length l has the inertia m_a l²/12 about its middle; the load is a point.
 
     Args:
-        env: The environment.
         env_ids: Which environments, ``None`` for all.
         load: ``load_mass`` [kg], ``load_length`` [m], ``arm_mass`` [kg].
-
-    Raises:
-        ValueError: If a value is not positive where it must be.
     """
     values = {**TEST_BENCH_LOAD, **load}
     mass, length, arm_mass = (float(values[key]) for key in TEST_BENCH_LOAD)

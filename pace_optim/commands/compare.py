@@ -12,6 +12,7 @@ from pace_optim.terminal.options import (
     add_common_options,
     add_device_option,
     add_log_options,
+    add_several,
     number,
     take_common_options,
 )
@@ -27,7 +28,7 @@ def main() -> None:
         example="scripts/compare.py logs/pace/anymal_d/26_01_01_12-00-00",
     )
     parser.add_argument("runs", nargs="+", metavar="RUN", help="folder of a run, as fit.py prints it")
-    parser.add_argument("--data", nargs="+", default=[], metavar="FILE", help="simulate these recordings instead")
+    add_several(parser, "--data", "FILE", "simulate these recordings instead")
     add_log_options(parser)
     parser.add_argument("--physics_dt", type=number, metavar="S", help="simulate at this physics step instead")
     add_common_options(parser, run=True)

@@ -10,7 +10,7 @@ from pace_optim.run.result import FitResult
 from pace_optim.run.summary import error_line, next_line, summary
 from pace_optim.terminal.choices import MEASURED_FACTS
 from pace_optim.terminal.cli import make_parser
-from pace_optim.terminal.options import add_common_options, add_device_option, number, take_common_options
+from pace_optim.terminal.options import add_common_options, add_device_option, add_several, number, take_common_options
 
 
 def main() -> None:
@@ -21,32 +21,19 @@ def main() -> None:
         example="scripts/diagnose.py logs/pace/anymal_d/26_11_21_12-00-00",
     )
     parser.add_argument("run", metavar="RUN", help="folder of a fit")
-    parser.add_argument(
-        "--effects", nargs="+", default=[], metavar="NAME", help="more candidates: your own as module:Class"
-    )
+    add_several(parser, "--effects", "NAME", "more candidates: your own as module:Class")
     parser.add_argument("--only", action="store_true", help="try nothing but --effects")
-    parser.add_argument(
-        "--measured",
-        nargs="+",
-        default=[],
-        metavar="FACT",
-        help=f"facts that you measured ({', '.join(MEASURED_FACTS)}): effects that contradict them are not tried",
-    )
-    parser.add_argument(
-        "--no_links", dest="links", action="store_false", help="do not look for wrong links of the model file first"
-    )
+    measured = f"facts that you measured ({', '.join(MEASURED_FACTS)}): effects that contradict them are not tried"
+    add_several(parser, "--measured", "FACT", measured)
+    links = "do not look for wrong links of the model file first"
+    parser.add_argument("--no_links", dest="links", action="store_false", help=links)
     parser.add_argument("--max_effects", type=int, default=3, metavar="K", help="most effects of a joint (default 3)")
     parser.add_argument("--physics_dt", type=number, metavar="S", help="physics step (default: half a control step)")
     refit = parser.add_mutually_exclusive_group()
-    refit.add_argument(
-        "--refit",
-        action="store_true",
-        default=None,
-        help="fit the robot with what lowers the error although it is not what is missing (default: only with what is)",
-    )
-    refit.add_argument(
-        "--no_refit", dest="refit", action="store_false", help="do not fit the robot with what was found"
-    )
+    always = "fit the robot with what lowers the error although it is not what is missing (default: only with what is)"
+    refit.add_argument("--refit", action="store_true", default=None, help=always)
+    never = "do not fit the robot with what was found"
+    refit.add_argument("--no_refit", dest="refit", action="store_false", help=never)
     add_common_options(parser, run=True)
     add_device_option(parser, needs="torch for CUDA")
     options = take_common_options(vars(parser.parse_args()))

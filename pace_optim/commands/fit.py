@@ -12,6 +12,7 @@ from pace_optim.terminal.options import (
     add_device_option,
     add_log_options,
     add_rate_option,
+    add_several,
     number,
     take_common_options,
 )
@@ -29,99 +30,47 @@ def main() -> None:
     )
     add_common_options(parser)
     add_device_option(parser)
-    parser.add_argument("--num_envs", type=int, default=512, help="simulations at once in a search (default 512)")
-    parser.add_argument(
-        "--data", nargs="+", default=[], metavar="FILE", help="recordings or logs (default: the robot's sample)"
-    )
+    add = parser.add_argument
+    add("--num_envs", type=int, default=512, help="simulations at once in a search (default 512)")
+    add_several(parser, "--data", "FILE", "recordings or logs (default: the robot's sample)")
     add_log_options(parser)
     add_rate_option(parser)
-    parser.add_argument(
-        "--trust_log", action="store_true", help="fit a log as it is although its checks name a fault, with a warning"
-    )
-    parser.add_argument(
-        "--joints",
-        metavar="REGEX",
-        help="joints to identify, the others are held where the log or the keyframe says (default: those of the log)",
-    )
-    parser.add_argument("--validation", nargs="+", default=[], metavar="FILE", help="recordings kept for validation")
-    parser.add_argument(
-        "--effects",
-        nargs="+",
-        default=[],
-        metavar="NAME",
-        help="effects to add: NAME, NAME@JOINTS, NAME[@JOINTS]@shared",
-    )
-    parser.add_argument(
-        "--links",
-        nargs="+",
-        default=[],
-        metavar="REGEX",
-        help="links whose inertial parameters are identified too: REGEX, or REGEX@mass,com,inertia,load with some of "
-        "these; load is a point mass on the link, such as a tool",
-    )
-    parser.add_argument(
-        "--unknown",
-        nargs="+",
-        default=[],
-        metavar="FACT",
-        help=f"unknown facts of the drives, to be identified: {', '.join(UNKNOWN_FACTS)}",
-    )
-    parser.add_argument(
-        "--residual",
-        nargs="+",
-        default=[],
-        choices=RESIDUALS,
-        metavar="NAME",
-        help="what is fitted: position (default), or position effort with the measured torques too",
-    )
-    parser.add_argument(
-        "--optimizer",
-        default="hybrid",
-        metavar="NAME",
-        help=f"{', '.join(OPTIMIZERS)} (default hybrid), or module:Class, a subclass of CMAESOptimizer whose tell() "
-        "adds the scores",
-    )
-    parser.add_argument(
-        "--stop",
-        nargs="+",
-        default=[],
-        metavar="RULE",
-        help="further rules that end the search: plateau, window, gradient, early_stopping, parameters, "
-        "target:score=S; with numbers as in plateau:generations=30,improvement=0.01",
-    )
-    parser.add_argument("--max_iteration", type=int, help="largest number of generations of the search")
-    parser.add_argument("--epsilon", type=number, help="stop at this relative spread of a generation's scores")
-    parser.add_argument("--sigma", type=number, help="initial standard deviation of the search, normalised")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
-        "--max_duration",
-        type=number,
-        metavar="S",
-        help="fit at most so much of each recording, where it moves the joints most (default: what can be)",
-    )
-    parser.add_argument("--delay_mode", choices=DELAY_MODES, help="what is delayed: the command or the whole torque")
-    parser.add_argument("--physics_dt", type=number, metavar="S", help="finer physics step under the same control rate")
+    add("--trust_log", action="store_true", help="fit a log as it is although its checks name a fault, with a warning")
+    joints = "joints to identify, the others are held where the log or the keyframe says (default: those of the log)"
+    add("--joints", metavar="REGEX", help=joints)
+    add_several(parser, "--validation", "FILE", "recordings kept for validation")
+    add_several(parser, "--effects", "NAME", "effects to add: NAME, NAME@JOINTS, NAME[@JOINTS]@shared")
+    links = "links whose inertial parameters are identified too: REGEX, or REGEX@mass,com,inertia,load with some of "
+    add_several(parser, "--links", "REGEX", f"{links}these; load is a point mass on the link, such as a tool")
+    unknown = f"unknown facts of the drives, to be identified: {', '.join(UNKNOWN_FACTS)}"
+    add_several(parser, "--unknown", "FACT", unknown)
+    residual = "what is fitted: position (default), or position effort with the measured torques too"
+    add_several(parser, "--residual", "NAME", residual, choices=RESIDUALS)
+    optimizer = f"{', '.join(OPTIMIZERS)} (default hybrid), or module:Class, a subclass of CMAESOptimizer whose tell() "
+    add("--optimizer", default="hybrid", metavar="NAME", help=f"{optimizer}adds the scores")
+    stop = "further rules that end the search: plateau, window, gradient, early_stopping, parameters, "
+    stop += "target:score=S; with numbers as in plateau:generations=30,improvement=0.01"
+    add_several(parser, "--stop", "RULE", stop)
+    add("--max_iteration", type=int, help="largest number of generations of the search")
+    add("--epsilon", type=number, help="stop at this relative spread of a generation's scores")
+    add("--sigma", type=number, help="initial standard deviation of the search, normalised")
+    add("--seed", type=int, default=0)
+    longest = "fit at most so much of each recording, where it moves the joints most (default: what can be)"
+    add("--max_duration", type=number, metavar="S", help=longest)
+    add("--delay_mode", choices=DELAY_MODES, help="what is delayed: the command or the whole torque")
+    add("--physics_dt", type=number, metavar="S", help="finer physics step under the same control rate")
     add_control_option(parser)
-    parser.add_argument(
-        "--drive_dt",
-        type=number,
-        metavar="S",
-        help="time between two runs of the drives' own controllers (PD loops); 0: they run continuously",
-    )
-    parser.add_argument("--joint_strategy", action="store_true", help="one search over all joints, not one per leg")
-    parser.add_argument("--save_optimization_process", action="store_true", help="keep every generation in progress.pt")
-    parser.add_argument(
-        "--no_consistency",
-        dest="check_consistency",
-        action="store_false",
-        help="do not fit each recording alone to see whether they agree",
-    )
-    parser.add_argument("--log_dir", default="logs/pace", metavar="DIR", help="where runs are kept (default logs/pace)")
-    parser.add_argument("--resume", metavar="RUN", help="go on with an interrupted run")
-    parser.add_argument(
-        "--diagnose", action="store_true", help="then find out what the model lacks, as pace diagnose does with the run"
-    )
-    parser.add_argument("--headless", action="store_true", help="accepted for PACE's command lines; nothing is shown")
+    rate = "time between two runs of the drives' own controllers (PD loops); 0: they run continuously"
+    add("--drive_dt", type=number, metavar="S", help=rate)
+    add("--joint_strategy", action="store_true", help="one search over all joints, not one per leg")
+    add("--save_optimization_process", action="store_true", help="keep every generation in progress.pt")
+    alone = "do not fit each recording alone to see whether they agree"
+    add("--no_consistency", dest="check_consistency", action="store_false", help=alone)
+    add("--log_dir", default="logs/pace", metavar="DIR", help="where runs are kept (default logs/pace)")
+    add("--resume", metavar="RUN", help="go on with an interrupted run")
+    diagnose = "then find out what the model lacks, as pace diagnose does with the run"
+    add("--diagnose", action="store_true", help=diagnose)
+    add("--headless", action="store_true", help="accepted for PACE's command lines; nothing is shown")
     args = vars(parser.parse_args())
     del args["headless"]
     then_diagnose = args.pop("diagnose")

@@ -2,7 +2,6 @@
 
 import argparse
 import io
-import shlex
 import sys
 from pathlib import Path
 
@@ -12,12 +11,10 @@ from matplotlib.figure import Figure
 
 from pace_actuators.files import refuse_taken, write_together
 from pace_optim.report.plots import plot_scores, plot_trajectories
-from pace_optim.run.find import find_mean, find_run, newest_mean
 from pace_optim.run.history import History
-from pace_optim.run.open import run_folder
-from pace_optim.run.replay import replay
+from pace_optim.run.open import find_mean, find_run, newest_mean, replay, run_folder
 from pace_optim.run.result import FitResult
-from pace_optim.run.tensors import read_mean, read_trajectory
+from pace_optim.run.tensors import existing, read_mean, read_trajectory
 from pace_optim.terminal.cli import make_parser
 from pace_optim.terminal.options import add_common_options, add_overwrite_option, take_common_options
 
@@ -100,17 +97,3 @@ def has_display() -> bool:
     except ImportError:
         return False
     return matplotlib.get_backend().lower() != "agg"
-
-
-def existing(path: Path) -> Path:
-    """The path.
-
-    Raises:
-        ValueError: If there is no such file.
-    """
-    if not path.exists():
-        raise ValueError(
-            f"{path.parent} has no {path.name} yet: the fit has not ended. Wait, or go on with "
-            f"scripts/fit.py --resume {shlex.quote(str(path.parent))}"
-        )
-    return path

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pace_actuators.files import refuse_taken
 from pace_optim.report.motion import motions_of
-from pace_optim.report.replay_page import write_replay
+from pace_optim.report.page import write_replay
 from pace_optim.report.run_data import RunData
 from pace_optim.terminal.cli import make_parser
 from pace_optim.terminal.options import add_overwrite_option, number
@@ -45,7 +45,7 @@ def _watch(run: RunData, recording: str | None, speed: float) -> None:
         raise ValueError("There is no screen to open MuJoCo's viewer on. Open the page in a browser instead.")
     if not 0 < speed <= 100:
         raise ValueError(f"--speed is {speed:g}, expected a number above 0 and up to 100.")
-    from pace_optim.report.motion.window import watch
+    from pace_optim.report.motion.motion import watch
 
     model = run.model()
     bias = run.result.parameters["encoder_bias"]

@@ -52,11 +52,7 @@ def main() -> None:
 
 
 def _task_for(identified: str | None) -> str:
-    """The task in which the robot of a fit walks.
-
-    Raises:
-        ValueError: If it does not exist, or no fit is given.
-    """
+    """The task in which the robot of a fit walks."""
     walking = [task for task in registered_tasks() if "-Velocity-" in task]
     if identified is None:
         raise ValueError(f"--task is missing. Available: {', '.join(walking)}, or a task of yours (module:Task).")

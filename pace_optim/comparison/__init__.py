@@ -4,7 +4,6 @@
 >>> content["worst_places"][0]["sentence"]
 """
 
-from .compare import VERSION, compare
-from .text import comparison_lines
+from .compare import VERSION, compare, comparison_lines
 
 __all__ = ["VERSION", "compare", "comparison_lines"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from pace_actuators.files import write_together
-from pace_actuators.text import listed, position_unit
+from pace_actuators.joint_units import joint_label, units_for
+from pace_actuators.text import listed, position_unit, shortened, three_figures
 from pace_optim.recording.noise import noise_floor
 from pace_optim.report import check_folder, report_text
 from pace_optim.run.open import run_folder
@@ -19,7 +21,7 @@ from pace_optim.run.tensors import held_out_spans
 
 from .error_regions import AT_THE_FLOOR, NEGLIGIBLE, worst_places
 from .joint import JointComparison, compare_joint, place_content, rmse_by_part
-from .ladder import check_alike, make_ladder
+from .ladder import check_alike, ladder_table, make_ladder
 from .tracks import RunTracks, Track, load_tracks
 
 VERSION = 1
@@ -175,3 +177,50 @@ def _dump(content: Any) -> str:
     """JSON to read by eye: a list of numbers stays on one line."""
     text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
     return re.sub(r"\[[^\[\]{}\"]*\]", lambda m: "[" + " ".join(m.group()[1:-1].split()) + "]", text) + "\n"
+
+
+def comparison_lines(content: dict[str, Any]) -> list[str]:
+    """A row per joint, the worst places, the ladder, as lines."""
+    joints = content["joints"]
+    parts = [part for part in ("train", "validation") if part in content["rmse"]]
+    values = [joint["rmse"].get(part) for joint in joints.values() for part in parts]
+    factor, unit = position_unit(values, ["hinge"])
+    types = [joint["type"] for joint in joints.values()]
+    labels = [joint_label(name, own, types, unit) for name, own in zip(joints, types, strict=True)]
+    width = max(5, *(len(label) for label in labels))
+    head = f"{'joint':{width}}" + "".join(f"  {part:>10}" for part in parts) + f"  {'noise':>10}  above noise"
+    lines = [f"{head}   [{units_for(unit, types)}]"]
+    for label, joint in zip(labels, joints.values(), strict=True):
+        cells = "".join(_cell(joint["rmse"].get(part), factor) for part in parts)
+        share = f"{100 * joint['share_above_floor']:.0f} %"
+        lines.append(f"{label:{width}}{cells}{_cell(joint['noise_floor'], factor)}  {share:>11}")
+    lines += _split(content, factor, "recording", [each["name"] for each in content["recordings"]])
+    lines += _split(content, factor, "drive", ["off", "on"])
+    lines += ["", content["summary"]]
+    lines += [f"  {place['sentence']}" for place in content["worst_places"]]
+    if "ladder" in content:
+        lines += ["", *ladder_table(content["ladder"], types)]
+    return lines + [f"note: {note}" for note in shortened(content["notes"], "note")]
+
+
+def _split(content: dict[str, Any], factor: float, name: str, labels: Sequence[str]) -> list[str]:
+    """The error of all joints, and the largest joint's, in each part of a dimension; nothing where it has one part.
+
+    Args:
+        factor: From SI units to those of the table.
+    """
+    found = {joint: one["where"][name]["rms"] for joint, one in content["joints"].items() if name in one["where"]}
+    if not found:
+        return []
+    width = max(len(name), *(len(label) for label in labels))
+    lines = ["", f"{name:{width}}  {'all joints':>10}  {'largest':>10}"]
+    for i, label in enumerate(labels):
+        values = {joint: rms[i] for joint, rms in found.items()}
+        worst = max(values, key=lambda joint: values[joint])
+        whole = math.sqrt(sum(value**2 for value in values.values()) / len(values))
+        lines.append(f"{label:{width}}{_cell(whole, factor)}{_cell(values[worst], factor)}  {worst}")
+    return lines
+
+
+def _cell(value: float | None, factor: float) -> str:
+    return f"  {'–' if value is None else three_figures(factor * value):>10}"

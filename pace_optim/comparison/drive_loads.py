@@ -63,7 +63,6 @@ def drive_loads(problem: Problem, evaluator: Evaluator, encoder_bias: np.ndarray
         τ = kp (q* − q) + kd (q̇* − q̇) + τ_ff
 
     Args:
-        problem: Recordings and drives.
         evaluator: Its environments hold each recording's load.
         encoder_bias: Of each joint, (n,) [rad].
     """

@@ -74,13 +74,9 @@ def places_of(
     """A joint's places, each in other dimensions than the ones before; empty where the error is spread evenly.
 
     Args:
-        joint: Its name.
         error: All recordings', (K,) [rad].
         floor: σ at each sample, (K,) [rad].
-        dimensions: What to look along.
-        layouts: The error along each.
         bands: Edges (B + 1,) [Hz], and shares (B,) of the octaves and of the error above the floor.
-        recordings: Their names.
     """
     above = error**2 - floor**2
     total = max(float(above.mean()), 0.0)

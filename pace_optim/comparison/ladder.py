@@ -19,11 +19,7 @@ _PARTS = ("train", "validation")
 
 
 def check_alike(runs: Sequence[RunTracks]) -> None:
-    """Runs can be compared if they have the same task and joints, and the same recordings, split alike.
-
-    Raises:
-        ValueError: If they do not; it says what differs.
-    """
+    """Runs can be compared if they have the same task and joints, and the same recordings, split alike."""
     first = runs[0]
     for other in runs[1:]:
         differences = []

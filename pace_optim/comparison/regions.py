@@ -58,7 +58,6 @@ def lay_out(error: np.ndarray, floor: np.ndarray, bins: np.ndarray, num_bins: in
         error: (K,) [rad].
         floor: Noise σ at each sample, (K,) [rad].
         bins: Each sample's bin, (K,) int.
-        num_bins: B.
     """
     count = np.bincount(bins, minlength=num_bins)
     square = np.bincount(bins, weights=error**2, minlength=num_bins)
@@ -114,7 +113,6 @@ def refine(
     Args:
         above: Squared error less floor at each sample, (K,).
         mask: The region's samples, (K,) bool.
-        region: The region.
         others: Dimensions to narrow it by, each with the weight of its evidence.
 
     Returns:

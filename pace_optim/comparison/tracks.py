@@ -100,16 +100,12 @@ def load_tracks(
     """A run's best parameters on its own recordings, or on others.
 
     Args:
-        folder: The run's folder.
         data: Recordings to simulate in place of the run's own.
         physics_dt: Simulate at this physics step in place of the run's [s].
         task: Another environment in place of the run's.
         columns: Column map of logs among ``data``; ``None``: guessed.
         strict: Whether one of ``data`` that cannot be used refuses all, instead of being set aside.
         device: Where it is simulated; on a GPU in any case, in float32.
-
-    Raises:
-        ValueError: If the run or a recording cannot be used.
     """
     result = FitResult.load(folder)
     simulate = bool(data) or physics_dt is not None or task is not None or device != "cpu"

@@ -24,7 +24,6 @@ def place_text(dimension: Dimension, region: Region, recordings: Sequence[str] =
 
     Args:
         dimension: What it is a region of.
-        region: The region.
         recordings: Names, for the dimension ``recording``.
     """
     low = dimension.edges[region.first] if region.first > 0 else None

@@ -8,8 +8,7 @@ from .cfg import CollectionCfg
 from .collect import Collection, collect
 from .command_line import cfg_from_args, make_collection_parser
 from .plot import plot_motion
-from .simulate import Encoder, Simulated, simulate
-from .truth import true_parameters
+from .simulate import Encoder, Simulated, simulate, true_parameters
 
 __all__ = [
     "Collection",

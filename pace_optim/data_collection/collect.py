@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from pace_envs import load_env_cfg, registered_tasks
+from pace_actuators.files import refuse_place, refuse_taken
+from pace_actuators.text import listed
+from pace_envs import ManagerBasedRLEnv, load_env_cfg, registered_tasks
 from pace_envs.registration import make_env
 from pace_envs.tasks.pace import PaceCfg
 from pace_optim.data_collection.plant import write_truth
@@ -24,18 +27,15 @@ from pace_optim.motion.design.motion_check import (
     summarise,
 )
 from pace_optim.motion.signals import Trajectory, make_excitation, write_command_csv
-from pace_optim.problem.drive_steps import set_control_step, set_drive_step
+from pace_optim.problem.drive_steps import of_joints, set_control_step, set_drive_step
 from pace_optim.problem.parameter_space import ParameterSpace
-from pace_optim.recording import save_recording
+from pace_optim.recording import SUFFIXES, save_recording, written_files
 
 from .cfg import CollectionCfg
 from .design import design_motion
-from .files import Files, plan_files, truth_file
 from .hidden import Hidden, simulate_hidden
 from .plot import plot_motion
-from .simulate import Encoder, Simulated, simulate
-from .speeds import driven_by_speed, told_speeds
-from .truth import true_parameters
+from .simulate import Encoder, Simulated, simulate, true_parameters
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +105,8 @@ def collect(cfg: CollectionCfg, report: Callable[[str], None] = lambda text: Non
         simulated: list[Simulated] = []
         hidden: Hidden | None = None
         if truth is not None and cfg.effects:
-            hidden = simulate_hidden(cfg, trajectories, space=space, truth=truth, delay_mode=_delay_mode(env))
+            mode = next(iter(env.scene["robot"].actuators.values())).cfg.delay_mode
+            hidden = simulate_hidden(cfg, trajectories, space=space, truth=truth, delay_mode=mode)
             simulated = hidden.simulated
         elif truth is not None:
             simulated = simulate(
@@ -180,10 +181,6 @@ def _sim2real(env_cfg: Any, task: str) -> PaceCfg:
     return sim2real
 
 
-def _delay_mode(env: Any) -> Literal["command", "effort"]:
-    return next(iter(env.scene["robot"].actuators.values())).cfg.delay_mode
-
-
 def _limits_of(env: Any) -> MotionLimits:
     robot = env.scene["robot"]
     velocity, effort = np.full(robot.num_joints, np.inf), np.full(robot.num_joints, np.inf)
@@ -199,3 +196,125 @@ def _limits_of(env: Any) -> MotionLimits:
         effort=effort,
         joint_types=robot.joint_types,
     )
+
+
+def driven_by_speed(env: ManagerBasedRLEnv, cfg: CollectionCfg) -> tuple[str, ...]:
+    """Joints whose drives follow speeds: those that the request names, and those without a proportional gain."""
+    names = np.array(env.scene["robot"].joint_names)
+    own = {"stiffness": cfg.stiffness, "damping": cfg.damping}
+    kp, kd = (of_joints(env, name) if value is None else np.full(len(names), value) for name, value in own.items())
+    by_speed = kp == 0.0
+    if cfg.velocity_joints is not None:
+        try:
+            named = np.array([re.fullmatch(cfg.velocity_joints, name) is not None for name in names])
+        except re.error as error:
+            raise ValueError(
+                f"--velocity_joints {cfg.velocity_joints!r} is no regular expression: {error}. Expected one such as "
+                "'.*wheel.*'."
+            ) from error
+        if not named.any():
+            raise ValueError(f"--velocity_joints {cfg.velocity_joints!r} fits no joint. Available: {', '.join(names)}.")
+        by_speed |= named
+    if loose := names[by_speed & (kd == 0.0)].tolist():
+        raise ValueError(
+            f"Nothing would move {listed(loose, 3)}: stiffness and damping are 0, so the drive follows torques, and "
+            "motions are made of positions and speeds. State the gains (--stiffness, --damping), or record with a "
+            "torque controller and log its commands (des_dof_effort)."
+        )
+    return tuple(names[by_speed].tolist())
+
+
+def told_speeds(trajectory: Trajectory, by_speed: tuple[str, ...], cfg: CollectionCfg) -> Trajectory:
+    """The trajectory, with speeds for these joints."""
+    if not by_speed:
+        return trajectory
+    if trajectory.has_jumps:
+        raise ValueError(
+            f"{cfg.excitation} jumps from target to target, and {listed(by_speed, 3)} follow speeds. Choose another "
+            "--excitation, such as chirp, multisine or ramp."
+        )
+    if cfg.effects:
+        raise ValueError(
+            f"The plant that hides effects follows positions, and {listed(by_speed, 3)} follow speeds. Omit --effect."
+        )
+    return replace(trajectory, by_speed=by_speed)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Files:
+    """Where one trajectory's files go; None for a file that is not written."""
+
+    recording: Path | None
+    """The recording."""
+    command: Path | None
+    """The commands alone."""
+    plot: Path | None
+    """The picture."""
+
+
+def plan_files(cfg: CollectionCfg, sim2real: PaceCfg, names: Sequence[str]) -> list[Files]:
+    """Name the files of every trajectory, and refuse what could not be written before the work is done.
+
+    Args:
+        sim2real: Says where files go that the request does not place.
+        names: Names of the trajectories; with several, each adds its own to the stem of its files.
+    """
+    _check("--output", cfg.output, SUFFIXES)
+    _check("--export_command", cfg.export_command, (".csv",))
+    _check("--plot", cfg.plot, (".png",))
+    folder, stem = Path("data") / sim2real.robot_name, _stem(cfg)
+    recording = None if cfg.command_only else _recording(cfg, sim2real)
+    command = cfg.export_command
+    if command is None and cfg.command_only:
+        command = folder / f"{stem}_command.csv"
+    plot = cfg.plot or (recording or command or folder).with_suffix(".png")
+    files = [
+        Files(
+            recording=_part(recording, name, len(names)),
+            command=_part(command, name, len(names)),
+            plot=None if cfg.no_plot else _part(plot, name, len(names)),
+        )
+        for name in names
+    ]
+    paths = [path for file in files for path in (file.recording, file.command, file.plot) if path]
+    if repeated := sorted({str(path) for path in paths if paths.count(path) > 1}):
+        raise ValueError(f"Two files would be written to {', '.join(repeated)}. Give each another name.")
+    recordings = [path for file in files if file.recording for path in written_files(file.recording)]
+    truth = [truth_file(cfg, sim2real)] if cfg.effects else []
+    refuse_taken(dict.fromkeys((*paths, *recordings, *truth)), option="--output", overwrite=cfg.overwrite)
+    return files
+
+
+def truth_file(cfg: CollectionCfg, sim2real: PaceCfg) -> Path:
+    """Where the truth is written: by the recording's stem (of several, their common part)."""
+    recording = _recording(cfg, sim2real)
+    return recording.with_name(f"{recording.stem}.truth.json")
+
+
+def _stem(cfg: CollectionCfg) -> str:
+    return f"{cfg.excitation}_optimized" if cfg.optimize else cfg.excitation
+
+
+def _recording(cfg: CollectionCfg, sim2real: PaceCfg) -> Path:
+    """Where a recording goes: as asked; where a fit looks for one of this motion; else under ``data/``."""
+    if cfg.output is not None:
+        return cfg.output
+    own = Path(sim2real.data_dir)
+    is_for_motion = own.stem.startswith(_stem(cfg)) and own.suffix.lower() in SUFFIXES
+    if is_for_motion and not own.is_absolute():
+        return sim2real.recording
+    return Path("data") / sim2real.robot_name / f"{_stem(cfg)}.npz"
+
+
+def _part(path: Path | None, name: str, count: int) -> Path | None:
+    return path.with_name(f"{path.stem}_{name}{path.suffix}") if path and count > 1 else path
+
+
+def _check(option: str, path: Path | None, suffixes: Sequence[str]) -> None:
+    if path is None:
+        return
+    refuse_place(path, option=option)
+    if path.suffix.lower() not in suffixes:
+        raise ValueError(
+            f"{option} {path}: found the suffix '{path.suffix}'; expected {' or '.join(suffixes)}. Rename the file."
+        )

@@ -17,6 +17,7 @@ from pace_optim.terminal.options import (
     add_control_option,
     add_overwrite_option,
     add_paces_options,
+    add_several,
     drop_paces_options,
     number,
     take_common_options,
@@ -57,50 +58,29 @@ def make_collection_parser() -> Parser:
         help="choose each joint's amplitude, centre, band and phases, within its limits, for the smallest error bars "
         "expected with --noise (default here 1e-4); prints them before and after",
     )
-    motion.add_argument(
-        "--reach",
-        type=number,
-        default=1.0,
-        metavar="FACTOR",
-        help="with --optimize, width of the range of targets as a multiple of PaceCfg.excitation's (default 1)",
-    )
+    reach = "with --optimize, width of the range of targets as a multiple of PaceCfg.excitation's (default 1)"
+    motion.add_argument("--reach", type=number, default=1.0, metavar="FACTOR", help=reach)
     robot = parser.add_argument_group("simulated robot")
-    robot.add_argument(
-        "--parameter",
-        action="extend",
-        nargs="+",
-        default=[],
-        metavar="NAME[/JOINT]=VALUE",
-        help="true parameters of all joints or one, in place of the robot's sample_params",
-    )
-    robot.add_argument(
-        "--effect",
-        action="extend",
-        nargs="+",
-        default=[],
-        metavar="NAME",
-        help="hide physical effects of a random size (by --seed) in the recordings; they are made by the independent "
+    truth = "true parameters of all joints or one, in place of the robot's sample_params"
+    add_several(robot, "--parameter", "NAME[/JOINT]=VALUE", truth, action="extend")
+    hidden = (
+        "hide physical effects of a random size (by --seed) in the recordings; they are made by the independent "
         "plant, and what was hidden goes to <recording>.truth.json. Available: "
-        f"{', '.join(library_effects())}; unknown to the diagnosis: {', '.join(outside_effects())}",
+        f"{', '.join(library_effects())}; unknown to the diagnosis: {', '.join(outside_effects())}"
     )
-    robot.add_argument(
-        "--effect_joints", default=".*", metavar="REGEX", help="joints that have the effects (default: all)"
-    )
+    add_several(robot, "--effect", "NAME", hidden, action="extend")
+    which = "joints that have the effects (default: all)"
+    robot.add_argument("--effect_joints", default=".*", metavar="REGEX", help=which)
     robot.add_argument("--stiffness", type=number, metavar="KP", help="gain of all joints [N m/rad], noted in the file")
     robot.add_argument("--damping", type=number, metavar="KD", help="gain of all joints [N m s/rad], noted in the file")
-    robot.add_argument(
-        "--velocity_joints",
-        metavar="REGEX",
-        help="joints whose drives follow speeds: commanded in des_dof_vel (default: those whose stiffness is 0)",
-    )
+    by_speed = "joints whose drives follow speeds: commanded in des_dof_vel (default: those whose stiffness is 0)"
+    robot.add_argument("--velocity_joints", metavar="REGEX", help=by_speed)
     robot.add_argument("--delay_mode", metavar="MODE", help="command or effort: what the delay delays")
     robot.add_argument("--physics_dt", type=number, metavar="S", help="finer physics step under the same control rate")
     robot.add_argument("--load_mass", type=number, metavar="KG", help="test bench: mass at the end of the arm")
     robot.add_argument("--load_length", type=number, metavar="M", help="test bench: length of the arm")
     robot.add_argument("--arm_mass", type=number, metavar="KG", help="test bench: mass of the arm")
-    robot.add_argument(
-        "--added_mass", action="extend", nargs="+", default=[], metavar="BODY=KG[@X,Y,Z]", help="masses added to bodies"
-    )
+    add_several(robot, "--added_mass", "BODY=KG[@X,Y,Z]", "masses added to bodies", action="extend")
     encoder = parser.add_argument_group("encoder")
     encoder.add_argument("--noise", type=number, default=0.0, metavar="RAD", help="standard deviation (default 0)")
     encoder.add_argument("--encoder_bits", type=int, metavar="B", help="2^B steps per turn (default: exact)")
@@ -118,11 +98,7 @@ def make_collection_parser() -> Parser:
 
 
 def cfg_from_args(args: argparse.Namespace) -> CollectionCfg:
-    """The request that parsed arguments make.
-
-    Raises:
-        ValueError: If one is malformed.
-    """
+    """The request that parsed arguments make."""
     options = take_common_options(vars(args))
     drop_paces_options(options)
     added = options.pop("added_mass")

@@ -19,8 +19,7 @@ from pace_optim.problem.problem import Problem
 from pace_optim.recording.dataset import make_dataset
 
 from .cfg import CollectionCfg
-from .simulate import draft_recordings
-from .truth import true_parameters
+from .simulate import draft_recordings, true_parameters
 
 USUAL_NOISE = 1e-4
 """Encoder noise to design for where none is given [rad]."""
@@ -29,18 +28,7 @@ USUAL_NOISE = 1e-4
 def design_motion(
     cfg: CollectionCfg, env: Any, unoptimized: Trajectory, limits: MotionLimits, report: Callable[[str], None]
 ) -> Design:
-    """Choose the motion after which the parameters are known best, if they are near the expected ones.
-
-    Args:
-        cfg: What is asked for.
-        env: The robot, one environment.
-        unoptimized: The motion to start from.
-        limits: The robot's.
-        report: Gets lines of progress.
-
-    Raises:
-        ValueError: If the request cannot be met.
-    """
+    """Choose the motion after which the parameters are known best, if they are near the expected ones."""
     sim2real, robot = env.cfg.sim2real, env.scene["robot"]
     space = ParameterSpace.of(sim2real)
     env_cfg, trees = copy.deepcopy(env.cfg), independent_trees(env)
@@ -81,8 +69,6 @@ def expected_parameters(sim2real: PaceCfg, space: ParameterSpace, overrides: Map
     """Where the parameters are expected: as given, else as in ``sample_params``, else in the middle of the bounds.
 
     Args:
-        sim2real: The robot's configuration.
-        space: Its parameters.
         overrides: By name (all joints) or ``name/joint``.
     """
     middle = space.to_physical(torch.zeros(space.size, dtype=torch.float64)).tolist()

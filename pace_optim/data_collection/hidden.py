@@ -62,14 +62,7 @@ def simulate_hidden(
     by one with the same seed are of one robot.
 
     Args:
-        cfg: What is asked for.
-        trajectories: The targets.
-        space: The parameters.
         truth: Their true values, (size,).
-        delay_mode: What the delay delays.
-
-    Raises:
-        ValueError: If an effect is unknown or stays invisible, or the robot is not one that the plant simulates.
     """
     for name in cfg.effects:
         effect_named(name)

@@ -29,10 +29,7 @@ def plot_motion(
     """Draw targets and positions over time as PNG, one panel per joint. The file appears whole or not at all.
 
     Args:
-        path: File to write.
-        trajectory: The targets.
         measured: Encoder positions, (T, n) [rad].
-        title: Above everything.
         position_limits: (n, 2) [rad]; drawn where they lie in or near the range of motion.
         joint_types: Whether each joint turns or slides; none: all turn.
     """

@@ -194,10 +194,6 @@ class TreeSearch:
         Args:
             history: The other one's ``history``: scores of each generation, (population_size, trees).
             line_generation: The other one's ``line_generation``.
-            after_generation: Called after each generation.
-
-        Raises:
-            ValueError: If the history does not fit.
         """
         self._planned_line, self._doers = line_generation, Processes()  # each for itself: the others may not do it
         for scores in history:
@@ -320,11 +316,7 @@ class CMAESOptimizer(TreeSearch):
         """Prepare the search.
 
         Args:
-            space: The parameters.
-            population_size: Candidates per generation.
-            cfg: Settings.
             trees: Groups of joint names that do not influence each other; ``None`` means one joint strategy.
-            seed: Seed of the search.
             start: Where to start, normalised (size,); ``None`` means the centre of the bounds.
             criteria: When a strategy stops; ``None`` means PACE's, with ``cfg.epsilon``.
             processes: Who shares the search: each process simulates its part of the candidates, and updates its
@@ -453,11 +445,7 @@ class CMAESOptimizer(TreeSearch):
         self._add(error, self._scored().weight)
 
     def _scored(self) -> Rollout:
-        """The rollout that is being scored.
-
-        Raises:
-            ValueError: If no rollout is being scored.
-        """
+        """The rollout that is being scored."""
         if self.scores_buffer is None or self.rollout is None:
             raise ValueError("There is no rollout to score. Call update_simulator first.")
         return self.rollout

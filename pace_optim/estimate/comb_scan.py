@@ -22,11 +22,7 @@ def scanned(
     amplitudes follow from the best one. All joints are moved at once: what one of them does to another counts little.
 
     Args:
-        space: The parameters.
-        evaluator: Simulates.
         x: The end of a descent, normalised (size,).
-        effects: The effects that are fitted.
-        joints: The robot's joints, in order.
     """
     result = None
     for cfg in (each for each in effects if each.effect_class.comb is not None):

@@ -149,9 +149,6 @@ def stop_rule(rule: Any) -> Criterion:
 
     Args:
         rule: ``"plateau"``, with numbers ``"plateau:generations=30,improvement=0.01"``, or a custom rule.
-
-    Raises:
-        ValueError: If there is no such rule or number.
     """
     if callable(rule):
         return rule

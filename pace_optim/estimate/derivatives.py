@@ -61,9 +61,7 @@ def colour(space: ParameterSpace, trees: Sequence[Sequence[str]], joint_names: S
     Entries whose bounds are equal are fixed: they belong to no colour and move no joint.
 
     Args:
-        space: The parameters.
         trees: Groups of joints that do not influence each other.
-        joint_names: All joints, in order.
     """
     index = {name: i for i, name in enumerate(joint_names)}
     owners = space.owners(trees)
@@ -130,7 +128,6 @@ def stencil(
 
     Args:
         x: Normalised vector, (size,).
-        colouring: Which entries are perturbed together.
         hessian: JᵀJ as it is known, (size, size), of which the principal directions are; ``None``: each entry alone.
         noise: The simulation's own noise, as :meth:`Stencil.noise` has it [rad].
         score: The score at x [rad²].

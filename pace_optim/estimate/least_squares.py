@@ -117,11 +117,7 @@ class Descent(DescentState):
 
     @classmethod
     def restore(cls, checkpoint: Mapping[str, np.ndarray]) -> list[Descent]:
-        """Descents as :func:`checkpoint_of` has them.
-
-        Raises:
-            ValueError: If its parts do not fit together.
-        """
+        """Descents as :func:`checkpoint_of` has them."""
         states = [
             checked(DescentState, each, "descents", "Start a new fit.")
             for each in json.loads(str(checkpoint["descents"]))
@@ -185,7 +181,6 @@ def least_squares(
     """Refine starts, one after the other, to the nearest minimum of the score.
 
     Args:
-        evaluator: Simulates.
         colouring: Which entries are perturbed together.
         starts: Normalised vectors, (size,), or descents to go on with.
         cfg: When a descent ends.
@@ -288,7 +283,6 @@ def by_chords(
     """Steps with known derivatives, as long as they gain what these promise.
 
     Args:
-        evaluator: Simulates.
         x: Normalised, (size,).
         there: Residuals at x, and derivatives near it.
         tolerance: The part of the score that a step gains at least.

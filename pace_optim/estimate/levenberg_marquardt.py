@@ -74,7 +74,6 @@ def bounded_step(x: torch.Tensor, hessian: torch.Tensor, gradient: torch.Tensor,
         x: Present vector, (size,).
         hessian: JᵀJ, (size, size).
         gradient: Jᵀr, (size,).
-        damping: μ.
 
     Returns:
         The new vector x + d, (size,).

@@ -28,11 +28,7 @@ _LONG = 5
 
 
 def optimizer_class(text: str) -> type[CMAESOptimizer]:
-    """The class that a fit names as ``module:Class`` or ``path/to/file.py:Class``, imported where it has to be.
-
-    Raises:
-        ValueError: If there is no such class, or it is no :class:`CMAESOptimizer`.
-    """
+    """The class that a fit names as ``module:Class`` or ``path/to/file.py:Class``, imported where it has to be."""
     module, name = split_reference(text)
     try:
         found = loaded_module(module) or import_named(module)
@@ -46,11 +42,7 @@ def use_recorded_optimizer(text: str, code: CodeRecord, where: str) -> None:
 
     Args:
         text: As for :func:`optimizer_class`.
-        code: The record.
         where: The file that names it, for messages.
-
-    Raises:
-        ValueError: If the code has changed or gone.
     """
     module, name = split_reference(text)
     if module == "__main__":
@@ -92,15 +84,7 @@ class Objective:
     """
 
     def __init__(self, kind: type[CMAESOptimizer], problem: Problem):
-        """Try it on the first sample.
-
-        Args:
-            kind: The optimizer.
-            problem: What is fitted.
-
-        Raises:
-            ValueError: If it fails there, or adds no error.
-        """
+        """Try it on the first sample."""
         self.kind, self.problem = kind, problem
         evaluator = problem.training_evaluator()
         at = problem.space.to_physical(problem.space.start)
@@ -122,7 +106,6 @@ class Objective:
         """The score of candidates, in parts in time; the sum over the parts is the score.
 
         Args:
-            evaluator: Simulates the recordings.
             physical: Physical parameters, (m, size).
             where: Which samples count, (T, R) bool.
 
@@ -185,11 +168,7 @@ class Objective:
 
 
 def build(kind: type[CMAESOptimizer], problem: Problem, population_size: int, cfg: Any, **options: Any) -> Any:
-    """An optimizer of a class that may have another constructor.
-
-    Raises:
-        ValueError: If that does not take what it is given.
-    """
+    """An optimizer of a class that may have another constructor."""
     given = (problem.space, population_size, cfg)
     try:
         inspect.signature(kind).bind(*given, **options)

@@ -15,8 +15,6 @@ def search(
     """Evolve until the optimizer has finished.
 
     Args:
-        optimizer: Proposes candidates.
-        rollout: Simulates them.
         after_generation: Called after each generation; it may call ``optimizer.stop``.
     """
     while not optimizer.finished():

@@ -76,9 +76,6 @@ class TreeStrategy:
         Args:
             entries: Which entries of the full vector it searches.
             start: Where it starts, normalised, (len(entries),).
-            sigma: Initial standard deviation, normalised.
-            population_size: Candidates per generation.
-            seed: Seed of its random numbers.
             criteria: When it stops, beside pycma's own conditions.
         """
         self.entries = np.asarray(entries)

@@ -71,11 +71,8 @@ class WayDown:
         """Prepare the stages.
 
         Args:
-            evaluator: Simulates the whole recordings.
-            colouring: Which entries are perturbed together.
             pieces: Simulates the pieces; ``None``: the whole recordings are the pieces.
             noise_score: Score that the measurement's noise alone leaves [rad²]; 0: unknown.
-            cfg: Numbers of the stages.
             on_iteration: Called with the stage's descents after each iteration.
             name: What its stages' names begin with, where a fit has several ways.
         """

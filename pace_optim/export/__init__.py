@@ -80,9 +80,6 @@ def export(path: str | Path, fmt: str, *, joints_only: bool = False, task: str |
         fmt: One of ``FORMATS``.
         joints_only: Leave the drives out of a model (``mjcf``).
         task: Another environment than that of the fit.
-
-    Raises:
-        ValueError: If the result is unusable, the format is unknown, or the robot's model has gone.
     """
     if fmt not in FORMATS:
         raise ValueError(f"There is no format {fmt!r}. Available: {', '.join(FORMATS)}.")

@@ -21,11 +21,7 @@ _DELAY = (
 
 
 def drive_groups(drives: IdentifiedDrives) -> dict[str, PaceDCMotorCfg]:
-    """The identified drives in the groups of the identification's robot, with gains and limits as far as known.
-
-    Raises:
-        ValueError: If the environment of the identification is not registered.
-    """
+    """The identified drives in the groups of the identification's robot, with gains and limits as far as known."""
     cfg = load_identified_cfg(drives)
     result = {}
     for group, drive in cfg.scene.robot.actuators.items():

@@ -41,11 +41,7 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
     """The robot's model with identified armature, damping and frictionloss, changed rigid bodies, and its drives.
 
     Args:
-        drives: What was identified.
         joints_only: Leave the actuators as they were: for a program that runs the drive itself.
-
-    Raises:
-        ValueError: If the environment of the identification is not available, or its model cannot be read.
     """
     cfg = load_identified_cfg(drives)
     source = Path(cfg.scene.robot.mjcf_path)

@@ -28,11 +28,7 @@ _START = "# --- the page starts here\n"
 
 
 def mjlab_native_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
-    """A page that needs mjlab alone: an actuator per joint, with mjlab's delay fields; friction; encoder bias.
-
-    Raises:
-        ValueError: If the environment of the identification is not available.
-    """
+    """A page that needs mjlab alone: an actuator per joint, with mjlab's delay fields; friction; encoder bias."""
     plain, notes = plain_drives(drives)
     notes = [*notes, *_notes(drives, plain), *effect_notes(drives, HELD), *link_notes(drives)]
     calls = [mjlab_actuator(drives, joint, drive) for joint, drive in plain.items()]

@@ -30,9 +30,6 @@ def newton_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
 
     The encoder's bias is a constant torque before the clamps, kp · bias: exact, as targets are the encoder's. So is a
     torque offset, but where a clamp acts. A spring beside the drive is the joint's.
-
-    Raises:
-        ValueError: If the environment of the identification is not available.
     """
     plain, notes = plain_drives(drives)
     notes = [*notes, *_notes(drives, plain), *effect_notes(drives, HELD), *link_notes(drives)]

@@ -104,9 +104,6 @@ def plain_drives(drives: IdentifiedDrives) -> tuple[dict[str, PlainDrive], list[
 
     Gains and limits are those that were in force in all recordings, otherwise those of the robot's configuration. A
     bias that the recordings do not determine is left out.
-
-    Raises:
-        ValueError: If the environment of the identification is not available.
     """
     result: dict[str, PlainDrive] = {}
     own = {name: _of_effect(drives, name) for name in GAIN_EFFECTS}
@@ -189,7 +186,6 @@ def effect_notes(drives: IdentifiedDrives, held: Sequence[str]) -> list[str]:
     """Which effects are held and which are not, in words.
 
     Args:
-        drives: What was identified.
         held: Names of the effects that the format holds.
     """
     notes = []

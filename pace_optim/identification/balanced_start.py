@@ -28,7 +28,7 @@ from scipy.optimize import least_squares
 from pace_envs.link_inertia import FIELDS, NAMES, PARTS, Reference, fields_of, pseudo_inertia_of
 from pace_envs.tasks.pace import GLOBAL
 from pace_optim.identification.log_checks.balance import FEWEST, Links, View, moving, views_of
-from pace_optim.problem.bounded_least_squares import bounded_least_squares
+from pace_optim.problem.inverse_dynamics import bounded_least_squares
 from pace_optim.problem.problem import Problem
 
 _FOUND = ("armature", "viscous_friction", "friction")

@@ -19,9 +19,15 @@ from pace_optim.estimate.error_bars.assessment import Assessment, assess, trajec
 from pace_optim.estimate.error_bars.consistency import Consistency, check_consistency
 from pace_optim.estimate.error_bars.far_from_noise import FAR_ABOVE_NOISE, far_end, times_noise
 from pace_optim.estimate.error_bars.loop_rate import LoopRates, loop_rates, used_loop
-from pace_optim.estimate.error_bars.step_share import change_without_step, step_share
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty
-from pace_optim.estimate.error_bars.undetermined import DELAY, held_at_prior, undetermined, without_delay
+from pace_optim.estimate.error_bars.undetermined import (
+    DELAY,
+    change_without_step,
+    held_at_prior,
+    step_share,
+    undetermined,
+    without_delay,
+)
 from pace_optim.estimate.error_bars.warnings import by_effect, fit_warnings, rough_motion
 from pace_optim.estimate.least_squares import LeastSquaresCfg
 from pace_optim.identification.optimization import NEAR, Optimization, Outcome
@@ -101,13 +107,7 @@ def conclude(
     """Write the result, then check it, and add what each check finds.
 
     Args:
-        run: What has ended.
-        record: Where its environment comes from.
-        outcome: Where it ended.
         keep_interrupted: Whether an interruption ends the checks; otherwise it is passed on. The file stays.
-
-    Raises:
-        ValueError: If the simulation diverges where it ended.
     """
     end = _reached(run, outcome)
     checks: Sequence[Callable[[Optimization, _End], _End]] = _CHECKS

@@ -21,14 +21,14 @@ from pace_optim.problem.recordings import tell_nobody, tell_on_stderr
 from pace_optim.recording.torque import NoTorqueError
 from pace_optim.report import check_folder, write_report
 from pace_optim.run.folder import RunFolder
-from pace_optim.run.inputs import (
+from pace_optim.run.open import (
+    Run,
     check_same_configuration,
     check_unchanged,
     input_digests,
     recording_digests,
     with_absolute_paths,
 )
-from pace_optim.run.open import Run
 from pace_optim.run.result import FitResult, assumptions
 from pace_optim.run.settings import FitSettings
 from pace_optim.run.tensors import read_bounds
@@ -109,7 +109,6 @@ def fit_with_torques(
 
     Args:
         settings: As for :func:`fit`; so are the others.
-        progress: Shows how far it is.
         processes: Who shares the search's candidates; where there are several, only the first fit is made.
     """
     progress = progress or ProgressLine()
@@ -177,7 +176,6 @@ def resume(
     """Go on with an interrupted fit; the result is that of one that was never interrupted.
 
     Args:
-        path: The run's folder.
         max_iteration: Another largest number of generations.
         progress: Shows how far it is.
         task: Where the run's environment is found now, if it has been moved.
@@ -216,13 +214,8 @@ def help_fit(processes: Processes, device: str, path: str | None = None, task: s
     """Simulate this process's share of the search's candidates, for the process that fits and writes.
 
     Args:
-        processes: All of them.
-        device: Where this one simulates.
         path: The run's folder, if it is resumed.
         task: As for :func:`resume`.
-
-    Raises:
-        ValueError: If another process is lost, or there is nothing here of what it fits.
     """
     start: Any = processes.agree(None)
     if start is None:

@@ -105,9 +105,6 @@ class Optimization:
         """Prepare evaluators and optimizers; nothing is simulated yet.
 
         Args:
-            settings: How to fit.
-            problem: What is fitted.
-            folder: Where it is written.
             progress: Shows how far it is.
             processes: Who shares the search's candidates.
         """
@@ -336,7 +333,6 @@ class Optimization:
         """Go on from the end of a fit at half its physics step, where that shows.
 
         Args:
-            problem: Of that end.
             x: That end, normalised (size,).
             there: Its residuals (m = 1).
             change: How they would change without a step, (K, R, n) [rad]; ``None``: that is not known.
@@ -525,11 +521,7 @@ class Optimization:
         return units_for(f"error {error:.3g} mrad", self.problem.joint_types)
 
     def refuse_divergence(self, score: float) -> None:
-        """Refuse a best candidate that diverges.
-
-        Raises:
-            ValueError: If the score is not finite.
-        """
+        """Refuse a best candidate that diverges."""
         if not np.isfinite(score):
             raise ValueError(
                 f"The best candidate's simulation diverges, so there is no result; {self.folder.path} holds the "
@@ -550,7 +542,6 @@ def with_structures(problem: Problem, start: Mapping[str, Any] | None, around: t
     """The problem with the structures of its effects held where a fit begins.
 
     Args:
-        problem: What is fitted.
         start: Parameters that it begins at; ``None``: at the space's start.
         around: The same as a physical vector (size,), if that is known.
     """

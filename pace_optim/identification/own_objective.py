@@ -39,14 +39,6 @@ def conclude_own(run: Optimization, record: EnvironmentRecord, outcome: Outcome)
 
     Positions are simulated and compared too: the errors of ``rmse`` are theirs. Nothing is refined, held at a prior or
     fitted again, since least squares minimise another objective.
-
-    Args:
-        run: What has ended.
-        record: Where its environment comes from.
-        outcome: Where it ended.
-
-    Raises:
-        ValueError: If there the simulation diverges.
     """
     problem, x, settings = run.problem, outcome.x, run.settings
     run.progress.say("error bars of the objective")
@@ -106,8 +98,6 @@ def error_bars(run: Optimization, objective: Objective, x: torch.Tensor) -> tupl
     too small.
 
     Args:
-        run: Its evaluators simulate.
-        objective: What was minimised.
         x: The minimum, normalised (size,).
     """
     space, where = run.problem.space, run.evaluator.dataset.train

@@ -33,12 +33,8 @@ def load_for_fit(settings: FitSettings, env_cfg: Any = None, tell: Callable[[str
     """Read everything, refuse what cannot be fitted, and try the simulation out.
 
     Args:
-        settings: What to fit, and how.
         env_cfg: The configuration of a run's task; ``None`` loads that of the settings' task.
         tell: Gets how the recordings are understood, and warnings of them.
-
-    Raises:
-        ValueError: If anything does not fit.
     """
     both = {Path(name).resolve() for name in settings.data} & {Path(name).resolve() for name in settings.validation}
     if both:
@@ -62,11 +58,7 @@ def load_for_fit(settings: FitSettings, env_cfg: Any = None, tell: Callable[[str
 
 
 def search_settings(problem: Problem, settings: FitSettings) -> CMAESOptimizerCfg:
-    """The search's own settings: the robot's, with what a fit asks for.
-
-    Raises:
-        ValueError: If there is no such stop rule, or an objective of the user's own fails.
-    """
+    """The search's own settings: the robot's, with what a fit asks for."""
     asked = {name: getattr(settings, name) for name in ("max_iteration", "epsilon", "sigma")}
     cfg = CMAESOptimizerCfg.of(problem.env_cfg.sim2real)
     cfg = replace(
@@ -96,9 +88,6 @@ def make_optimizer(
     """The search of a fit.
 
     Args:
-        problem: What is fitted.
-        settings: How.
-        processes: Who shares the search.
         around: Physical parameters (size,) around which a hybrid searches what it searches by magnitude; the rest it
             searches from the start of the parameters. ``None``: PACE's search, all from there.
     """
@@ -134,11 +123,7 @@ _BYTES_PER_VALUE = 100
 
 
 def try_out(problem: Problem) -> None:
-    """Simulate one candidate on each recording for some steps: what cannot be applied fails before anything is kept.
-
-    Raises:
-        ValueError: If the motion is not finite; an effect that makes it so alone is named.
-    """
+    """Simulate one candidate on each recording for some steps: what cannot be applied fails before anything is kept."""
     if _stays_finite(problem):
         return
     guilty = [label for label in problem.effects if not _stays_finite(problem.with_effects([label]))]
@@ -152,12 +137,7 @@ def check_size(problem: Problem, simulated: int, num_envs: int) -> None:
     """Refuse a search for which there is no memory, before the run has a folder.
 
     Args:
-        problem: What is fitted.
         simulated: How many simulations the search makes at once.
-        num_envs: How many were asked for.
-
-    Raises:
-        ValueError: If there is too little.
     """
     env = problem.make_env(1)
     each = bytes_per_env(env.sim.model) + _BYTES_PER_VALUE * problem.space.size

@@ -26,9 +26,6 @@ def set_control_step(cfg: PaceSim2realEnvCfg) -> None:
 
     Args:
         cfg: The environment; its drives are changed.
-
-    Raises:
-        ValueError: If a drive runs slower than the environment.
     """
     control_dt = cfg.sim.dt * cfg.decimation
     for drive in cfg.scene.robot.actuators.values():
@@ -104,9 +101,6 @@ def check_loops(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> list
 
     Returns:
         A note per recording whose loop is unstable with the armature of the configuration; empty if it is not.
-
-    Raises:
-        ValueError: If a loop is unstable even with the largest armature that may be identified.
     """
     names = env.scene["robot"].joint_names
     dt = of_joints(env, "_run_dt")

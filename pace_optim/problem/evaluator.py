@@ -132,8 +132,6 @@ class Evaluator:
 
         Args:
             make_env: Builds the environment with a given number of environments.
-            dataset: The recordings.
-            space: The parameters.
             trees: Groups of joints that do not influence each other; none: all are one.
             phases: What is not known of free phases; ``None``: what the candidates themselves show of that.
             nearby: Simulates candidates whose differences count, at a longer physics step; ``None``: this one.

@@ -192,12 +192,7 @@ def _whitened(columns: torch.Tensor, factor: torch.Tensor) -> torch.Tensor:
 
 
 def blocks_of(carried: Carried, trees: Sequence[Sequence[int]]) -> tuple[Block, ...]:
-    """The free phases of joints that move each other, where all of them are free, in parts.
-
-    Args:
-        carried: R recordings.
-        trees: Groups of joints, by index.
-    """
+    """The free phases of joints that move each other, where all of them are free, in parts."""
     result = []
     for r in carried.moves.nonzero()[:, 0].tolist():
         for tree in trees:
@@ -278,7 +273,6 @@ def encoder_noise(carried: Carried, error: torch.Tensor) -> torch.Tensor:
     """The encoders' noise, by what errors of free joints have that no motion has, (R, n) [rad].
 
     Args:
-        carried: R recordings.
         error: Of a candidate, at all control steps, (T, R, n) [rad].
     """
     free, usual = carried.free[: len(error)], carried.start_std[..., 0]
@@ -335,8 +329,6 @@ def free_phases(
     little while it remembers a push.
 
     Args:
-        carried: R recordings.
-        trees: Groups of joints, by index.
         change: What :class:`PhaseProbes` change of what encoders show at all control steps, (2 depth + 6, T, R, n).
         error: Of the candidate without those changes, (T, R, n) [rad].
         control_dt: [s].
@@ -376,7 +368,6 @@ def _disturbed(blocks: Sequence[Block], square: Sequence[float]) -> list[float]:
     """What the covariance of each block is multiplied by: more than 1 where its errors are far above its leg's.
 
     Args:
-        blocks: The blocks.
         square: Of each, the mean square of its errors over what is expected.
     """
     legs: dict[tuple[int, ...], list[float]] = {}

@@ -17,9 +17,6 @@ def independent_trees(env: ManagerBasedEnv) -> list[list[str]]:
     Each kinematic tree of the model is a group (for a fixed base: each leg). Equality constraints (closed chains, mimic
     joints) and tendons tie the trees that they hold together; contacts can tie all.
 
-    Args:
-        env: The environment.
-
     Returns:
         Groups of joint names, in the order of the joints.
     """

@@ -1,7 +1,9 @@
-"""Whether recordings fit what is stated of their robot: limits, gains that are only assumed, closed chains."""
+"""What recordings say of their robot's drives: whether stated facts fit, how far a fit seeks, how hard they work."""
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import cast
@@ -10,13 +12,102 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
+from pace_actuators.base_parameters import CARRIED
 from pace_actuators.joint_units import JointType, units_for
 from pace_actuators.text import listed
-from pace_envs import ManagerBasedRLEnv
+from pace_envs import ManagerBasedEnv, ManagerBasedRLEnv
+from pace_envs.from_model import defaults
+from pace_envs.from_model.scaling import OF_BOUNDS, largest_parameters
 from pace_envs.tasks.pace import PaceSim2realEnvCfg
+from pace_envs.tasks.pace.pace_cfg import PaceCfg
 from pace_optim.problem.drive_steps import of_joints
 from pace_optim.recording import Recording
 from pace_optim.recording.commands import acting_loops
+from pace_optim.recording.dataset import Dataset, Work
+
+_PLACEHOLDER = 10.0
+"""Times what a drive was asked for that its effort limit may be at most."""
+_SMOOTH = 0.02
+"""Positions are averaged over this time before they are differentiated [s]."""
+
+
+def widen_bounds(sim2real: PaceCfg, env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> None:
+    """Seek as far as the drives allow that the recordings state; a start moves with its bound.
+
+    A model file's bounds are parts of its effort limits. Where it has none, they come from its inertia and gravity: of
+    a light link with a strong drive they exclude what is there. A drive's scale then is the limit that a recording
+    states; without one, what its gains ask for at an error of half a radian, and what they did ask for. An effort limit
+    of ten times that is a placeholder: in a box of a million times a wrist's armature no derivative is right.
+
+    Args:
+        sim2real: The bounds and starts; changed.
+        env: The environment, for the limits and gains that a recording does not state.
+        recordings: On the robot's joints, in its order.
+    """
+    upper = {name: sim2real.bounds[name][:, 1].clone() for name in CARRIED}
+    least, most = np.max([_scales(env, sim2real, recording) for recording in recordings], axis=0)
+    speed = np.nan_to_num(of_joints(env, "velocity_limit"), nan=np.inf)
+    for j, joint in enumerate(sim2real.joint_order):
+        low, high = (
+            largest_parameters(float(effort[j]), float(speed[j]), is_slide=joint in sim2real.slide_joints)
+            for effort in (least, most)
+        )
+        for name in CARRIED:
+            reach = min(max(float(upper[name][j]), low[name]), high[name])
+            if reach != float(upper[name][j]):
+                upper[name][j] = reach
+                starts = sim2real.start_params[name] | {joint: OF_BOUNDS * reach}  # type: ignore[operator]
+                sim2real.start_params = {**sim2real.start_params, name: starts}
+    for name, high in upper.items():
+        sim2real.set_bounds(name, upper=high)
+
+
+def _scales(env: ManagerBasedRLEnv, sim2real: PaceCfg, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """Least and most that a recording says of each drive's largest torque, (n,) each [N m]; 0 and infinity: nothing."""
+    drive, configured = recording.drive, of_joints(env, "effort_limit")
+    length = np.where(np.isin(sim2real.joint_order, sim2real.slide_joints), defaults.SLIDE_LENGTH, 1.0)
+    if drive.stiffness is None and drive.damping is None:
+        asked, most = np.zeros(len(length)), np.full(len(length), np.inf)
+    else:
+        kp = of_joints(env, "stiffness") if drive.stiffness is None else drive.stiffness
+        asked = np.maximum(0.5 * kp * length, np.abs(asked_torque(env, recording)).max(axis=0))
+        most = _PLACEHOLDER * asked
+    limit = configured if drive.effort_limit is None else drive.effort_limit
+    known = np.isfinite(limit) & (drive.effort_limit is not None)
+    return np.where(np.isfinite(limit), np.where(known, limit, 0.0), asked), np.where(known, np.inf, most)
+
+
+def _half(recording: Recording) -> int:
+    """Samples on each side that a position is averaged with."""
+    return max(1, round(0.5 * _SMOOTH * (recording.num_samples - 1) / recording.duration))
+
+
+def asked_torque(env: ManagerBasedEnv, recording: Recording) -> np.ndarray:
+    """What the drives were asked for, within the configured limits, (T, n) [N m]."""
+    speed = np.gradient(_smooth(recording.dof_pos, _half(recording)), recording.time, axis=0)
+    kp, kd = gains(env, recording)
+    steps = recording.sample_steps
+    asked_speed = 0.0 if recording.command_vel is None else recording.command_vel[steps]
+    torque = kp * (recording.sampled_command - recording.dof_pos) + kd * (asked_speed - speed)
+    torque += 0.0 if recording.command_effort is None else recording.command_effort[steps]
+    limit = of_joints(env, "effort_limit")
+    return np.clip(torque, -limit, limit)
+
+
+def gains(env: ManagerBasedEnv, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """Stiffness [N m/rad] and damping [N m s/rad] of the drives' loops, (n,) each."""
+    kp, kd = (
+        of_joints(env, name) if getattr(recording.drive, name) is None else getattr(recording.drive, name)
+        for name in ("stiffness", "damping")
+    )
+    return kp, kd
+
+
+def _smooth(position: np.ndarray, half: int) -> np.ndarray:
+    """Each position averaged with its neighbours on both sides, (T, n)."""
+    padded = np.pad(position, ((half + 1, half), (0, 0)), mode="edge").cumsum(axis=0)
+    return (padded[2 * half + 1 :] - padded[: -2 * half - 1]) / (2 * half + 1)
+
 
 _STATE = (
     "state them beside the log (NAME.json: stiffness, damping), in its column map, or in your configuration "
@@ -28,9 +119,6 @@ def without_loops_of_torques(env: ManagerBasedRLEnv, recording: Recording) -> Re
     """The recording; a torque that it commands is all that moves a joint, where the gains are only assumed.
 
     A damping that the recording states stays: it acts on the measured speed.
-
-    Raises:
-        ValueError: If a joint gets only positions, and its drive has no position loop.
     """
     drive, names = recording.drive, np.array(recording.joint_names)
     stiffness, damping = (
@@ -93,9 +181,6 @@ def refuse_open_loops(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -
     Args:
         env: The environment; its first simulation takes each posture.
         recordings: On the robot's joints, in its order.
-
-    Raises:
-        ValueError: If one cannot; the message says how far its loop is open.
     """
     robot = env.scene["robot"]
     loops = robot.closed_loops
@@ -156,3 +241,61 @@ def contradicted_limits(
         if beyond:
             notes.append(f"the recording contradicts the stated {words}: {'; '.join(beyond)}. Correct {field}. [W2]")
     return notes
+
+
+_BIN = 0.25
+"""Over so much time the square of a torque is averaged [s]."""
+_TIMES_ASKED = 2.0
+"""How many times the largest torque that was asked a drive may give that states no limit."""
+
+
+def drive_reach(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> dict[str, float]:
+    """The largest torque of each joint's drive [N m]: its limit, else twice what was asked; infinite: not known."""
+    limit = np.max([_limit(env, recording) for recording in recordings], axis=0)
+    asked = np.max([np.abs(_asked(env, recording)).max(axis=0) for recording in recordings], axis=0)
+    largest = np.where(np.isfinite(limit), limit, np.where(asked > 0, _TIMES_ASKED * asked, math.inf))
+    return dict(zip(env.scene["robot"].joint_names, largest.tolist(), strict=True))
+
+
+def loop_stiffness(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> dict[str, float]:
+    """The stiffness of each joint's position loop [N m/rad], the median of the recordings' where it has one."""
+    stated = [each.drive.stiffness for each in recordings]
+    own = of_joints(env, "stiffness")
+    median = np.median([own if each is None else each for each in stated], axis=0)
+    names = env.scene["robot"].joint_names
+    return {name: each for name, each in zip(names, median.tolist(), strict=True) if each > 0 and math.isfinite(each)}
+
+
+def with_work(dataset: Dataset, env: ManagerBasedRLEnv) -> Dataset:
+    """The dataset with how hard the drives worked, where its recordings are of one session: they do not overlap.
+
+    Args:
+        env: The environment, whose facts hold where a recording states none.
+    """
+    begins, ends, squares = [], [], []
+    for start, recording in zip(dataset.session_start.tolist(), dataset.recordings, strict=True):
+        since = recording.time - recording.time[0]
+        edges = np.linspace(0.0, since[-1], max(1, round(since[-1] / _BIN)) + 1)
+        square = np.nan_to_num(_asked(env, recording)) ** 2
+        bins = (np.searchsorted(edges, since, side="right") - 1).clip(max=len(edges) - 2)
+        count = np.bincount(bins, minlength=len(edges) - 1).clip(min=1)
+        squares.append([np.bincount(bins, column, len(edges) - 1) / count for column in square.T])
+        begins.append(start + edges[:-1])
+        ends.append(start + edges[1:])
+    order = np.argsort([each[0] for each in begins])
+    if any(ends[a][-1] > begins[b][0] + _BIN for a, b in itertools.pairwise(order.tolist())):
+        return dataset
+    begin, end, square = (torch.as_tensor(np.concatenate(each, axis=-1)) for each in (begins, ends, squares))
+    return replace(dataset, work=Work(begin=begin, end=end, square=square.T))
+
+
+def _asked(env: ManagerBasedRLEnv, recording: Recording) -> np.ndarray:
+    """What drives were asked for, within the limit in force, (T, n) [N m]."""
+    limit = _limit(env, recording)
+    return np.clip(asked_torque(env, recording), -limit, limit)
+
+
+def _limit(env: ManagerBasedRLEnv, recording: Recording) -> np.ndarray:
+    """The limit in force, (n,) [N m]; infinite where none is stated."""
+    stated = recording.drive.effort_limit
+    return np.nan_to_num(of_joints(env, "effort_limit") if stated is None else stated, nan=np.inf, posinf=np.inf)

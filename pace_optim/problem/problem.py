@@ -22,9 +22,7 @@ from pace_envs.link_inertia import Reference
 from pace_envs.model_file.read import is_model_file
 from pace_envs.motor_coordinates import Rows
 from pace_envs.simulation import Simulation
-from pace_envs.tasks.pace import GLOBAL, PaceSim2realEnvCfg, sought_links
-from pace_optim.problem.base_path import BasePath, base_path
-from pace_optim.problem.bounds_of_logs import widen_bounds
+from pace_envs.tasks.pace import GLOBAL, PaceCfg, PaceSim2realEnvCfg, sought_links
 from pace_optim.problem.drive_steps import (
     check_loops,
     least_armature,
@@ -34,16 +32,19 @@ from pace_optim.problem.drive_steps import (
     set_drive_rate,
     set_drive_step,
 )
-from pace_optim.problem.drive_work import drive_reach, loop_stiffness, with_work
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.kinematic_trees import independent_trees
 from pace_optim.problem.log_and_robot import (
     contradicted_limits,
+    drive_reach,
+    loop_stiffness,
     refuse_open_loops,
     told_of_gains,
+    widen_bounds,
+    with_work,
     without_loops_of_torques,
 )
-from pace_optim.problem.moving_base import on_moving_base
+from pace_optim.problem.moving_base import BasePath, base_path, on_moving_base
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.recordings import Logs, conform_all, read_logs, tell_on_stderr
 from pace_optim.problem.unknown_facts import GAINS, LIMITS, lift_limits, refined_limits, with_unknown
@@ -135,7 +136,6 @@ class Problem:
         """Build the environment.
 
         Args:
-            num_envs: Number of environments.
             simulation: What builds its simulation; ``None`` keeps the configuration's.
         """
         cfg = copy.deepcopy(self.env_cfg)
@@ -189,15 +189,22 @@ class Problem:
         Args:
             bounds: Lower and upper bound by label, ``<parameter>/<joint>``; of this problem's parameters alone.
         """
-        plain, cfg = copy.deepcopy(self.plain_cfg), copy.deepcopy(self.env_cfg)
-        for each in (plain, cfg):
-            for name, own in each.sim2real.bounds.items():
+
+        def widen(sim2real: PaceCfg) -> None:
+            for name, own in sim2real.bounds.items():
                 keys = (GLOBAL,) if BASE_PARAMETERS[name].shared else self.joint_names
                 other = own.new_tensor(
                     [bounds.get(f"{name}/{key}", pair) for key, pair in zip(keys, own.tolist(), strict=True)]
                 )
-                low, high = torch.minimum(own, other)[:, 0], torch.maximum(own, other)[:, 1]
-                each.sim2real.set_bounds(name, low, high)
+                sim2real.set_bounds(name, torch.minimum(own, other)[:, 0], torch.maximum(own, other)[:, 1])
+
+        return self._changed(widen)
+
+    def _changed(self, change: Callable[[PaceCfg], object]) -> Problem:
+        """The same with another configuration of what is identified."""
+        plain, cfg = copy.deepcopy(self.plain_cfg), copy.deepcopy(self.env_cfg)
+        for each in (plain, cfg):
+            change(each.sim2real)
         return replace(self, plain_cfg=plain, env_cfg=cfg, space=ParameterSpace.of(cfg.sim2real))
 
     def with_physics_dt(self, physics_dt: float) -> Problem:
@@ -219,10 +226,7 @@ class Problem:
 
     def seeking(self, links: Sequence[Reference]) -> Problem:
         """The same with the inertial parameters of these links identified."""
-        plain, cfg = copy.deepcopy(self.plain_cfg), copy.deepcopy(self.env_cfg)
-        for each in (plain, cfg):
-            each.sim2real.links = tuple(links)
-        return replace(self, plain_cfg=plain, env_cfg=cfg, space=ParameterSpace.of(cfg.sim2real))
+        return self._changed(lambda sim2real: setattr(sim2real, "links", tuple(links)))
 
     def with_links(self, links: Mapping[str, LinkInertia]) -> Problem:
         """The same with these inertial parameters of links, which are not identified any more."""
@@ -233,11 +237,8 @@ class Problem:
 
     def on_positions(self) -> Problem:
         """The same without the torques that are followed."""
-        plain, cfg = copy.deepcopy(self.plain_cfg), copy.deepcopy(self.env_cfg)
-        for each in (plain, cfg):
-            each.sim2real.torque_offsets = {}
-        dataset, space = replace(self.dataset, torques=None), ParameterSpace.of(cfg.sim2real)
-        return replace(self, plain_cfg=plain, env_cfg=cfg, dataset=dataset, space=space)
+        without = self._changed(lambda sim2real: setattr(sim2real, "torque_offsets", {}))
+        return replace(without, dataset=replace(self.dataset, torques=None))
 
     @property
     def torque_noise(self) -> dict[str, float]:
@@ -342,11 +343,7 @@ class Facts:
         drive_dt: float | None = None,
         motors: Rows | None = None,
     ) -> Facts:
-        """Read what a task says of its robot; the arguments are those of :func:`load_problem`.
-
-        Raises:
-            ValueError: If it is no identification task, or the delay's mode or bounds are unusable.
-        """
+        """Read what a task says of its robot; the arguments are those of :func:`load_problem`."""
         of_file = motors if is_model_file(task) else None
         cfg = load_env_cfg(task, control_dt, of_file) if env_cfg is None else copy.deepcopy(env_cfg)
         if not isinstance(cfg, PaceSim2realEnvCfg):

@@ -82,16 +82,11 @@ def read_logs(
 
     Args:
         groups: Files and folders, each as :func:`pace_optim.recording.logs.load_recordings` takes it.
-        env: The robot.
         joints: Regular expression of the joints that are to be identified; ``None``: those of the recordings.
         columns: Column map of the logs among them; ``None``: guessed.
         rate: Rows per second of logs that have no column of time [Hz].
         strict: Whether one that cannot be used refuses all, instead of being set aside.
         tell: Gets what was understood of logs, and what was set aside.
-
-    Raises:
-        ValueError: If none of a group can be used, or one cannot and ``strict``; or a joint can be neither identified
-            nor held.
     """
     chosen = with_rate(None if columns is None else read_map(Path(columns)), rate)
     known = known_robot(env)
@@ -137,10 +132,6 @@ def conform_all(
         env: The robot, its other joints held.
         control_dt: Control step [s].
         strict: As for :func:`read_logs`.
-        tell: Gets what was set aside.
-
-    Raises:
-        ValueError: As for :func:`read_logs`.
     """
     robot, known = env.scene["robot"], known_robot(env)
     sim2real, model = env.cfg.sim2real, env.sim.model  # type: ignore[attr-defined]

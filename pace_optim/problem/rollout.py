@@ -54,8 +54,6 @@ class Rollout:
 
         Args:
             env: Its number of environments must be a multiple of the number of recordings.
-            dataset: The recordings.
-            space: The parameters.
 
         Raises:
             ValueError: If the number of environments does not fit, or a recording's facts cannot be simulated.
@@ -559,7 +557,6 @@ def between_steps(seen: torch.Tensor, at: torch.Tensor, *, ring: bool = False) -
 
     Args:
         seen: One sample per step.
-        at: The steps.
         ring: Whether the samples are those of the last steps, each at its step modulo the length.
     """
     whole = at.floor()

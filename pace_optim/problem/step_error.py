@@ -16,7 +16,6 @@ def step_error(problem: Problem, physical: torch.Tensor, where: torch.Tensor) ->
     Zero where it cannot be simulated, or nothing counts.
 
     Args:
-        problem: What is simulated.
         physical: One candidate, (size,).
         where: Which samples count, (T, R) bool.
     """

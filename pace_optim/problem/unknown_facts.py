@@ -31,11 +31,7 @@ _FACTOR = 10.0
 
 
 def check_unknown(facts: Iterable[str]) -> None:
-    """Refuse what cannot be unknown.
-
-    Raises:
-        ValueError: If a fact has no effect that finds it.
-    """
+    """Refuse what cannot be unknown."""
     if wrong := [fact for fact in facts if fact not in UNKNOWN_FACTS]:
         raise ValueError(f"--unknown {wrong[0]} is not understood. Available: {', '.join(UNKNOWN_FACTS)}.")
 
@@ -73,7 +69,6 @@ def lift_limits(
 
     Args:
         cfg: The environment; its drives lose these limits.
-        recordings: The recordings.
         facts: What is unknown; gains among it are left alone.
     """
     facts = [fact for fact in facts if fact in LIMITS]
@@ -108,7 +103,6 @@ def refined_limits(
 
     Args:
         recordings: The recordings; all have these limits, as their torques say them.
-        joints: The joints.
         effects: What is fitted; nothing changes where a limit is among it.
 
     Returns:
@@ -138,9 +132,6 @@ def with_identified(
 
     Args:
         cfg: The environment, whose facts hold where a recording states none.
-        recordings: The recordings.
-        facts: What was unknown.
-        parameters: What was found.
         undetermined: Labels of what the recordings leave open.
     """
     facts, left_open, joints = list(facts), set(undetermined), list(cfg.sim2real.joint_order)
@@ -176,9 +167,6 @@ def identified_gains(
 
     Args:
         cfg: The environment, whose gains hold where a recording states none.
-        recordings: The recordings.
-        facts: What was unknown.
-        parameters: What was found.
         undetermined: Labels of what the recordings leave open.
         unit_of: Unit of a parameter of a joint.
     """

@@ -12,7 +12,7 @@ from pace_actuators.text import listed
 from .data import Recording
 from .facts import as_array, check_one_line, couplings_of, drive_of, feet_of, imu_of, joint_names_of, load_of
 from .keys import BASE_COLUMNS, COMMAND_SERIES, FACTS, JOINT_SERIES, POSE_COLUMNS, SERIES, closest
-from .stamps import seconds_of, set_back, unrounded
+from .time_base import seconds_of, set_back, unrounded
 
 _HUGE = 1e6
 """No joint turns so far or so fast [rad], [rad/s]."""
@@ -29,7 +29,6 @@ def check_recording(
 
     Args:
         fields: The file's keys and values; array-likes, text, numbers, dicts.
-        source: Path, for messages.
         default_name: The recording's name when the fields hold none.
         found: What the file calls its fields (a CSV's columns), for messages; default: the keys.
     """
@@ -331,11 +330,7 @@ def _check_commands(recording: Recording) -> None:
 
 
 def refuse_uncommanded(recording: Recording, names: Sequence[str]) -> None:
-    """Say which joints nothing commands.
-
-    Raises:
-        ValueError: Always.
-    """
+    """Say which joints nothing commands."""
     idle = [name for name, flag in zip(names, recording.is_commanded, strict=True) if not flag]
     raise ValueError(
         f"{recording.label}: {listed(idle)}: no command (des_dof_pos, des_dof_vel and des_dof_effort are NaN or "

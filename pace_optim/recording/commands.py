@@ -11,8 +11,7 @@ from pace_actuators.drive_result import CommandTiming
 
 from .data import Recording
 from .keys import COMMAND_SERIES
-from .resample import hold_on_grid
-from .time_base import TimeBase
+from .time_base import TimeBase, hold_on_grid
 
 GRID_COMMANDS = {"des_dof_pos": "command", "des_dof_vel": "command_vel", "des_dof_effort": "command_effort"}
 """The field of a conformed recording that holds each command on the control grid."""
@@ -27,7 +26,6 @@ def commands_on_grid(recording: Recording, base: TimeBase, control_dt: float) ->
 
     Args:
         recording: Before its samples were put on the grid; no sample comes before its first command.
-        base: How they are put there.
         control_dt: Control step [s].
     """
     stride, count = base.sample_stride, base.num_steps

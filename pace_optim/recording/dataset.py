@@ -14,11 +14,132 @@ import torch
 from pace_actuators.text import listed
 from pace_optim.recording import Recording, validation_start, with_columns
 from pace_optim.recording.moving_base import GRAVITY, Carried, force_noise, measured_motion, read_earlier
-from pace_optim.recording.noise import LEAST_NOISE, noise_variance
-from pace_optim.recording.resample import interpolate_linear
-from pace_optim.recording.sessions import session_starts
-from pace_optim.recording.start import start_speed
+from pace_optim.recording.noise import LEAST_NOISE, noise_floor, noise_variance
+from pace_optim.recording.time_base import interpolate_linear
 from pace_optim.recording.torque import TorqueChannel
+
+_PAUSE = 6 * 3600.0
+"""A pause after which drives are as cold as at the beginning: what comes later is another session [s]."""
+_UNIX = 9e8
+"""Clocks that show more than this show Unix time [s]."""
+_OVERLAP = 0.1
+"""Recordings of one clock do not overlap by more than this [s]."""
+
+
+def session_starts(recordings: Sequence[Recording]) -> tuple[np.ndarray, tuple[str, ...]]:
+    """When each recording began since the first of its session, (R,) [s], and a note on each (empty without stamps).
+
+    Stamps place recordings where all show Unix time, or where none does and their spans do not overlap (one clock, and
+    not one that starts anew with each file). A pause of more than six hours, such as between days, begins another
+    session. Without such stamps the recordings are taken to have been made one after another, in their order.
+    """
+    began = np.array([recording.start_stamp for recording in recordings])
+    if not _one_clock(began, np.array([recording.duration for recording in recordings])):
+        return np.cumsum([0.0, *(recording.duration for recording in recordings[:-1])]), ("",) * len(recordings)
+    order = np.argsort(began, kind="stable")
+    since, session = np.zeros(len(began)), np.zeros(len(began), dtype=int)
+    first = until = began[order[0]]
+    number = 0
+    for r in order:
+        if began[r] - until > _PAUSE:
+            first, number = began[r], number + 1
+        since[r], session[r] = began[r] - first, number
+        until = max(until, began[r] + recordings[r].duration)
+    which = f"session {{}} of {number + 1}" if number else "its session"
+    notes = tuple(
+        f"Began {s:.6g} s after the first recording of {which.format(k + 1)}, by its time stamps."
+        for s, k in zip(since, session, strict=True)
+    )
+    return since, notes if len(recordings) > 1 else ("",)
+
+
+def _one_clock(began: np.ndarray, duration: np.ndarray) -> bool:
+    """Whether stamps of all recordings are of one clock."""
+    unix = began > _UNIX
+    if unix.any():
+        return bool(unix.all())
+    order = np.argsort(began)
+    return bool(np.all(began[order][1:] >= (began + duration)[order][:-1] - _OVERLAP))
+
+
+_LONGEST = 0.25
+"""Time from the beginning in which a slope is sought [s]."""
+_DEGREES = (1, 2, 3)
+"""Of the polynomials that the motion is taken for there."""
+_LENGTHS = 16
+"""Numbers of samples that are tried of each."""
+_FREEDOM = 2
+"""Samples that a window has beyond a polynomial's coefficients, at least."""
+_FITS = 2.0
+"""Standard deviations of χ² by which a polynomial may miss the samples."""
+_STANDS_OUT = 4.0
+"""Standard deviations at which a speed is one."""
+_CLEAR = 5.0
+"""Times the noise that a joint has moved where its motion shows."""
+_AT_ONCE = 0.8
+"""Part of the speed with which it must have done so: a motion that sets in has less."""
+_LEAST_NOISE = 5e-6
+"""Of any encoder: a clean simulation has none, and no polynomial fits it [rad]."""
+
+
+def start_speed(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """The speed of each joint at the first sample, and whether anything is known of it.
+
+    Polynomials of several degrees are fitted to more and more of the first samples. Where one misses them by no more
+    than their noise, the polynomial of one degree more gives the slope: what the first one misses is small, not
+    nothing. The slope counts that noise moves least:
+
+        v = c₁ of Σ c_i tⁱ,   σ_v² = σ² [(AᵀA)⁻¹]₁₁,   A_ki = t_kⁱ
+
+    Its standard deviation is σ_v and c₂ Δt together, Δt the time between samples: where a held command arrives, the
+    acceleration 2 c₂ begins within them. A speed below 4 of them counts as zero: what begins at rest keeps exactly 0.
+
+    Returns:
+        Speeds, (n,) [rad/s], and whether a polynomial fits, (n,) bool; as recorded where the recording holds speeds.
+    """
+    time = recording.time - recording.time[0]
+    count = int(np.searchsorted(time, _LONGEST))
+    recorded = np.full(recording.num_joints, np.nan) if recording.dof_vel is None else recording.dof_vel[0]
+    speed, known = np.nan_to_num(recorded), ~np.isnan(recorded)
+    for joint in np.flatnonzero(~known).tolist():
+        position = recording.dof_pos[:, joint]
+        noise = max(noise_floor(position, float(np.median(np.diff(time)))).sigma, _LEAST_NOISE)
+        found = _slope(time[:count], position[:count], noise)
+        if found is not None:
+            slope, std = found
+            moves = abs(slope) > _STANDS_OUT * std and _at_once(time, position, slope, noise)
+            speed[joint], known[joint] = slope if moves else 0.0, True
+    return speed, known
+
+
+def _at_once(time: np.ndarray, position: np.ndarray, slope: float, noise: float) -> bool:
+    """Whether the first samples that could stand out of the noise move with a speed: at rest, they have not yet."""
+    first = min(int(np.searchsorted(time, _CLEAR * noise / abs(slope))), len(time) - 1)
+    first = max(first, 1)
+    return float(position[first] - position[0]) / float(time[first]) / slope > _AT_ONCE
+
+
+def _slope(time: np.ndarray, position: np.ndarray, noise: float) -> tuple[float, float] | None:
+    """The surest slope at the beginning and its standard deviation; ``None`` where no polynomial fits."""
+    best: tuple[float, float, float] | None = None
+    for degree in _DEGREES:
+        least = degree + 2 + _FREEDOM
+        for count in np.unique(np.geomspace(least, max(least, len(time)), _LENGTHS).astype(int)).tolist():
+            if count > len(time):
+                continue
+            scaled, moved = time[:count] / time[count - 1], position[:count] - position[0]
+            powers = np.vander(scaled, degree + 2, increasing=True)
+            fewer = powers[:, :-1]
+            missed = np.square(fewer @ np.linalg.lstsq(fewer, moved, rcond=None)[0] - moved).sum() / noise**2
+            freedom = count - degree - 1
+            if missed > freedom + _FITS * np.sqrt(2 * freedom):
+                continue
+            _, slope, bend, *_ = np.linalg.lstsq(powers, moved, rcond=None)[0] / time[count - 1]
+            noisy = noise * np.sqrt(np.linalg.inv(powers.T @ powers)[1, 1]) / time[count - 1]
+            if best is None or noisy < best[0]:
+                best = float(noisy), float(slope), float(np.hypot(noisy, bend * scaled[1]))
+    return None if best is None else best[1:]
+
 
 _TURN = 4.0
 """Of a robot that walks, so much time is trained and validated on in turns [s]."""
@@ -55,7 +176,6 @@ class Work:
         Args:
             time: Since the session began, (rows, 1) [s].
             time_constant: T, (rows, joints) [s].
-            joints: Which joints.
         """
         edges = (each.to(time_constant) for each in (self.begin, self.end))
         first, last = (torch.exp(-(time - edge).clamp(min=0.0)[:, :, None] / time_constant[:, None]) for edge in edges)
@@ -104,7 +224,6 @@ class Torques:
         """Those of a dataset's recordings.
 
         Args:
-            dataset: The recordings.
             channel: Which joints' torques count, and their noise.
             held: Whether drives hold their torques for a control step.
         """
@@ -346,9 +465,6 @@ def make_dataset(
         validation: Never trained on. Without any, the last part in time of each recording is kept for it.
         train_fraction: Which part of each recording is trained on when ``validation`` is empty; 1 keeps nothing. Of
             a base that moves, it is that part of every 4 s or so.
-
-    Raises:
-        ValueError: If there is no recording.
     """
     every = (*recordings, *validation)
     if not recordings:

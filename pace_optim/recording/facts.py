@@ -27,11 +27,7 @@ def as_array(value: Any) -> np.ndarray:
 
 
 def check_one_line(label: str, text: str, source: str) -> None:
-    """Refuse a name that holds line breaks or what steers a terminal.
-
-    Raises:
-        ValueError: If it does.
-    """
+    """Refuse a name that holds line breaks or what steers a terminal."""
     if not text.isprintable():
         raise ValueError(f"{source}: {label} is {text!r}; expected one line of printable text. Correct it.")
 
@@ -42,7 +38,6 @@ def joint_names_of(value: Any, num_joints: int, source: str) -> tuple[str, ...]:
     Args:
         value: The file's "joint_names", or None.
         num_joints: Number of columns that the names must cover.
-        source: Path, for messages.
     """
     if value is None:
         return ()
@@ -68,10 +63,8 @@ def drive_of(fields: Mapping[str, Any], joint_names: tuple[str, ...], commanded:
     """Read the drive's facts: a number for all joints, one per joint in column order, or {joint: value}.
 
     Args:
-        fields: The file's keys and values.
         joint_names: Names of the columns, () without names.
         commanded: Which columns have commands, (n,) bool: the others may be left out of {joint: value}.
-        source: Path, for messages.
     """
     given = {key: fields[key] for key in DRIVE_FACTS if fields.get(key) is not None}
     return Drive(**{k: _per_joint(k, v, joint_names, commanded, source) for k, v in given.items()})
@@ -86,11 +79,7 @@ def load_of(fields: Mapping[str, Any], source: str) -> Load:
 
 
 def imu_of(value: Any, source: str) -> ImuPose:
-    """Where the IMU is: a site's name, or ``{body, pos, quat}``.
-
-    Raises:
-        ValueError: If it is neither.
-    """
+    """Where the IMU is: a site's name, or ``{body, pos, quat}``."""
     if value is None:
         return ImuPose()
     if isinstance(value, str) and value.lstrip().startswith("{"):  # in an .npz
@@ -118,11 +107,7 @@ def imu_of(value: Any, source: str) -> ImuPose:
 
 
 def couplings_of(value: Any, source: str) -> dict[str, dict[str, float]]:
-    """Motors that move several joints, {motor: {joint: ratio}}; none where none are stated.
-
-    Raises:
-        ValueError: If it is something else.
-    """
+    """Motors that move several joints, {motor: {joint: ratio}}; none where none are stated."""
     if isinstance(value, str):  # in an .npz
         with suppress(ValueError):  # the message below shows what is no JSON
             value = parsed_json(value)
@@ -146,11 +131,7 @@ def couplings_of(value: Any, source: str) -> dict[str, dict[str, float]]:
 
 
 def feet_of(value: Any, count: int, source: str) -> tuple[str, ...]:
-    """Names of the feet that contacts are of, () where none are given.
-
-    Raises:
-        ValueError: If there is not one for each column.
-    """
+    """Names of the feet that contacts are of, () where none are given."""
     if value is None:
         return ()
     names = value.tolist() if isinstance(value, np.ndarray) else value

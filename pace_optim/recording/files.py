@@ -1,26 +1,44 @@
-"""Read and write recordings: `.pt`, `.npz` and `.csv`, facts in the file or in a JSON of the same stem."""
+"""Read and write recordings: `.pt`, `.npz` and `.csv`, facts in the file or in a JSON of the same stem.
+
+A CSV has columns `time`, `torque_enable`, `<series>/<joint>`, and `real_ee_pose/x` to `/qz`. Commands with a separate
+clock have a column `des_time`; the clock with fewer rows leaves the last cells empty.
+"""
 
 from __future__ import annotations
 
+import csv
+import io
+import itertools
 import json
 import os
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import fields as dataclass_fields
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import torch
 
 from pace_actuators.files import parsed_json, read_tensors, write_atomically, writing
+from pace_actuators.memory import check_memory
 from pace_actuators.text import listed
 from pace_optim.terminal.arrays import read_arrays
 
 from .checks import check_recording
-from .csv_format import read_csv, write_csv
 from .data import ImuPose, Recording
 from .facts import as_array, couplings_of
-from .keys import DRIVE_FACTS, FACTS, SERIES, did_you_mean
+from .keys import (
+    BASE_COLUMNS,
+    COMMAND_SERIES,
+    DRIVE_FACTS,
+    FACTS,
+    FEET_SERIES,
+    JOINT_SERIES,
+    POSE_COLUMNS,
+    SERIES,
+    did_you_mean,
+)
 
 SUFFIXES = (".pt", ".npz", ".csv")
 
@@ -54,11 +72,7 @@ def load_recording(path: str | os.PathLike[str], rate: float = 0.0) -> Recording
 
 
 def stated_couplings(paths: Sequence[str | os.PathLike[str]]) -> dict[str, dict[str, float]]:
-    """Motors that recordings and logs state, {motor: {joint: ratio}}: in themselves or in the JSON beside them.
-
-    Raises:
-        ValueError: If two of them contradict each other, or what one states is unusable.
-    """
+    """Motors that recordings and logs state, {motor: {joint: ratio}}: in themselves or in the JSON beside them."""
     found: dict[str, dict[str, float]] = {}
     first = ""
     for path in map(Path, paths):
@@ -221,3 +235,199 @@ def _same(one: Any, other: Any) -> bool:
     if isinstance(one, dict) or isinstance(other, dict):
         return one == other
     return np.array_equal(as_array(one), as_array(other))
+
+
+Rows = list[list[str]] | np.ndarray
+"""Cells as text, or all of them as numbers."""
+_DATE = re.compile(r"\d{4}-\d{2}-\d{2}")
+_WHOLE = re.compile(r"\d{13,19}$")
+_LONGEST_LINE = 1 << 20
+_BYTES_PER_BYTE = 12
+"""Memory of a file's cells as text, for each of its bytes."""
+_WORDS = {"true": 1.0, "false": 0.0}
+
+
+def read_csv(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Return the fields of a CSV file, and its columns as they are called there."""
+    header, rows = _read_numbers(path) or _read_cells(path)
+    if repeated := sorted({c for c in header if header.count(c) > 1}):
+        raise ValueError(f"{path}: the column(s) {listed(repeated)} appear twice. Keep one of each.")
+    columns: dict[str, dict[str, int]] = {}
+    for index, column in enumerate(header):
+        series, _, joint = column.partition("/")
+        columns.setdefault(series, {})[joint] = index
+    joints = list(columns.get("dof_pos", {}))
+    fields: dict[str, Any] = {}
+    two_clocks = "des_time" in columns
+    for series, index_of in columns.items():
+        clock = "des_time" if two_clocks and series in ("des_time", *COMMAND_SERIES) else "time"
+        own = rows[: _length(rows, list(columns.get(clock, {}).values()))] if two_clocks else rows
+        if series in ("time", "des_time"):
+            fields[series] = _stamps(path, series, own, next(iter(index_of.values())))
+        elif series == "torque_enable":
+            indices = list(index_of.values())
+            values = np.stack([_numbers(path, header[i], own, i) for i in indices], axis=1)
+            fields[series] = values[:, 0] if len(indices) == 1 else values
+        elif series == "real_ee_pose" and set(index_of) in (set(POSE_COLUMNS[:3]), set(POSE_COLUMNS)):
+            names = POSE_COLUMNS[: len(index_of)]
+            fields[series] = np.stack([_numbers(path, f"{series}/{c}", own, index_of[c]) for c in names], axis=1)
+        elif series in BASE_COLUMNS and set(index_of) == set(BASE_COLUMNS[series]):
+            names = BASE_COLUMNS[series]
+            fields[series] = np.stack([_numbers(path, f"{series}/{c}", own, index_of[c]) for c in names], axis=1)
+        elif series in FEET_SERIES and "" not in index_of:
+            fields |= _of_feet(path, series, index_of, own, fields.get("feet"))
+        elif series in JOINT_SERIES and joints:
+            _check_joints(path, series, list(index_of), joints, header)
+            none = np.full(len(own), np.nan)
+            fields[series] = np.stack(
+                [_numbers(path, f"{series}/{j}", own, index_of[j]) if j in index_of else none for j in joints], axis=1
+            )
+        else:
+            fields[series] = ()  # the check of the keys says what becomes of it
+    if joints:
+        fields["joint_names"] = joints
+    return fields, tuple(header)
+
+
+def _of_feet(
+    path: Path, series: str, index_of: Mapping[str, int], rows: Rows, feet: list[str] | None
+) -> dict[str, Any]:
+    """Contacts by foot, or forces with three columns ``<foot>/x`` to ``/z`` each, and the names of the feet."""
+    parts = {name.rpartition("/")[2] for name in index_of}
+    axes = ("x", "y", "z") if parts == {"x", "y", "z"} else ()
+    found = list(dict.fromkeys(name.rpartition("/")[0] if axes else name for name in index_of))
+    feet = feet or found
+    wanted = [[f"{foot}/{axis}" for axis in axes] or [foot] for foot in feet]
+    if set(found) != set(feet) or not {name for names in wanted for name in names} <= set(index_of):
+        raise ValueError(
+            f"{path}: {series} has the columns {listed(index_of)}; expected one for each of the feet {listed(feet)}, "
+            "or three of them, /x, /y and /z. Correct them."
+        )
+    values = [[_numbers(path, f"{series}/{name}", rows, index_of[name]) for name in names] for names in wanted]
+    array = np.stack([np.stack(each, axis=1) for each in values], axis=1)
+    return {"feet": feet, series: array if axes else array[..., 0]}
+
+
+def write_csv(
+    file: IO[bytes], series: Mapping[str, np.ndarray], joint_names: tuple[str, ...], feet: tuple[str, ...] = ()
+) -> None:
+    """Write series as CSV; every number with as many digits as it takes to read back the same."""
+    num_joints = series["dof_pos"].shape[1]
+    joints = joint_names or tuple(f"joint_{i}" for i in range(num_joints))
+    header: list[str] = []
+    columns: list[list[Any]] = []
+    for key, values in series.items():
+        if values.ndim == 1:
+            header.append(key)
+            columns.append((values.astype(int) if values.dtype == bool else values).tolist())
+            continue
+        names: tuple[str, ...] = BASE_COLUMNS.get(key, joints)
+        if key == "real_ee_pose":
+            names = POSE_COLUMNS[: values.shape[1]]
+        elif key in FEET_SERIES:
+            names = feet if values.ndim == 2 else tuple(f"{foot}/{axis}" for foot in feet for axis in "xyz")
+        for name, column in zip(names, values.reshape(len(values), -1).T, strict=True):
+            if not np.isnan(column).all():
+                header.append(f"{key}/{name}")
+                columns.append((column.astype(int) if column.dtype == bool else column).tolist())
+    text = io.TextIOWrapper(file, encoding="utf-8", newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(itertools.zip_longest(*columns, fillvalue=""))
+    text.flush()
+    text.detach()
+
+
+def _read_numbers(path: Path) -> tuple[list[str], np.ndarray] | None:
+    """Column names and all cells, (rows, columns), where every cell is a number; else ``None``.
+
+    It is read many times faster so than cell by cell, and takes as much memory as its numbers.
+    """
+    check_memory(2 * path.stat().st_size, f"{path}: reading it", "Cut it into parts.")
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            header = [column.strip() for column in next(csv.reader([file.readline(_LONGEST_LINE)]), [])]
+            first = file.readline(_LONGEST_LINE).split(",")
+            if len(header) < 2 or any(_WHOLE.match(cell.strip()) for cell in first):  # stamps that floats would round
+                return None
+            rest = np.loadtxt(itertools.chain([",".join(first)], file), delimiter=",", comments=None, ndmin=2)
+    except (ValueError, csv.Error):  # refused below, with the place
+        return None
+    return (header, rest) if rest.shape[1] == len(header) else None
+
+
+def _read_cells(path: Path) -> tuple[list[str], list[list[str]]]:
+    check_memory(_BYTES_PER_BYTE * path.stat().st_size, f"{path}: reading it", "Leave no cell empty, or cut it.")
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            rows = [row for row in csv.reader(file) if row]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path}: cannot be read as CSV text ({error}). Save it as comma-separated UTF-8.") from error
+    if not rows:
+        raise ValueError(f"{path}: is empty; expected a line of column names, then one line per sample.")
+    header = [column.strip() for column in rows[0]]
+    if len(header) == 1:
+        raise ValueError(
+            f"{path}: has one column, '{header[0][:60]}'; expected time, dof_pos/<joint>, "
+            "des_dof_pos/<joint>. Separate the columns by commas."
+        )
+    for line, row in enumerate(rows[1:], start=2):
+        if len(row) != len(header):
+            raise ValueError(
+                f"{path}: row {line} has {len(row)} cells but the header has {len(header)}. "
+                "Complete or delete the row (the last one is often cut short)."
+            )
+    return header, rows[1:]
+
+
+def _check_joints(path: Path, series: str, found: list[str], joints: list[str], header: list[str]) -> None:
+    if "" in found:
+        raise ValueError(
+            f"{path}: the column '{series}' names no joint; expected '{series}/<joint>'. Rename it. "
+            f"Columns found: {listed(header)}."
+        )
+    if not set(found) <= set(joints):
+        raise ValueError(
+            f"{path}: {series} has the joints {listed(found)} but dof_pos has {listed(joints)}. "
+            f"Give every series the same joints (or leave out those without). Columns found: {listed(header)}."
+        )
+
+
+def _length(rows: Rows, indices: list[int]) -> int:
+    """Rows up to the last that has a value in one of the columns."""
+    count = len(rows)
+    if isinstance(rows, np.ndarray):
+        return count
+    while count and not any(rows[count - 1][i].strip() for i in indices):
+        count -= 1
+    return count
+
+
+def _stamps(path: Path, column: str, rows: Rows, index: int) -> np.ndarray:
+    """Stamps as numbers, whole numbers exactly; as text where they are dates."""
+    if isinstance(rows, np.ndarray):
+        return rows[:, index]
+    cells = [row[index].strip() for row in rows]
+    if cells and (_DATE.match(cells[0]) or _WHOLE.match(cells[0])):
+        try:
+            return np.array(cells) if _DATE.match(cells[0]) else np.array([int(cell) for cell in cells])
+        except (ValueError, OverflowError):  # refused below
+            pass
+    return _numbers(path, column, rows, index)
+
+
+def _numbers(path: Path, column: str, rows: Rows, index: int) -> np.ndarray:
+    if isinstance(rows, np.ndarray):
+        return np.ascontiguousarray(rows[:, index])
+    words = _WORDS if column.startswith("torque_enable") else {}
+    values = np.empty(len(rows))
+    for row, cells in enumerate(rows):
+        cell = cells[index].strip()
+        try:
+            values[row] = words[cell.lower()] if cell.lower() in words else float(cell)
+        except ValueError:
+            raise ValueError(
+                f"{path}: row {row + 2}, column '{column}' holds '{cell}'; expected a number. "
+                "Correct the cell, or delete the row."
+            ) from None
+    return values

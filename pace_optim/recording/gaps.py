@@ -38,9 +38,6 @@ def split_at_gaps(recording: Recording) -> list[Recording]:
 
     Args:
         recording: As it was read, before it is put on a control grid.
-
-    Raises:
-        ValueError: If nothing between its gaps is long enough.
     """
     time = recording.time
     step = np.diff(time)

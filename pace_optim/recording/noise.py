@@ -75,7 +75,6 @@ def with_repetitions(floors: Sequence[NoiseFloor], positions: Sequence[np.ndarra
     Of the squared error of the mean of K repetitions, σ²/K cannot be explained; of each one's own, σ².
 
     Args:
-        floors: Of each repetition from itself.
         positions: Each repetition's, (K,) [rad]; the longer ones are cut.
 
     Returns:

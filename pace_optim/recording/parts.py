@@ -50,10 +50,6 @@ def affordable(
         columns: Parameters whose derivatives are computed each by itself.
         evaluations: Of the accelerations in a control step.
         max_duration: How long each may be [s]; ``None``: as long as there are not too many derivatives.
-        tell: Gets what was left out.
-
-    Raises:
-        ValueError: If there is too little memory for what was asked.
     """
     every = [recording for group in recordings for recording in group]
     per_second = columns * max((recording.num_joints for recording in every), default=1) / control_dt
@@ -82,7 +78,6 @@ def informative_parts(recording: Recording, longest: float) -> list[Recording]:
     chosen one after another. Of a robot that walks, only the speed of joints that are free counts.
 
     Args:
-        recording: Conformed.
         longest: How long they may be together [s].
     """
     dt = float(recording.time[1] - recording.time[0])

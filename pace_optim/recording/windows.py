@@ -42,7 +42,6 @@ class Windows:
         """All windows of a dataset.
 
         Args:
-            dataset: R recordings.
             control_dt: [s].
         """
         recording, first, own, end = (torch.tensor(each) for each in zip(*_windows(dataset, control_dt), strict=True))

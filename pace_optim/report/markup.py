@@ -91,10 +91,8 @@ def figure(
     """A plotly figure, which the page's script draws in the page's colours.
 
     Args:
-        id: Its name in the page.
         data: Traces. A colour may be one of the style sheet's, as ``"var(--simulated)"``.
         layout: What differs from the page's plain look.
-        height: In pixels.
         views: Ways to look at it, one button each: {"label": str, "trace": {...}, "layout": {...}} as
             ``Plotly.update`` takes them.
     """
@@ -118,8 +116,6 @@ def choice(name: str, entries: Sequence[str], group: str = "", at: int = 0) -> M
     """Radio buttons that look like pills: arrow keys go from one to the next.
 
     Args:
-        name: What is chosen.
-        entries: From what.
         group: Sets them apart from another choice of the same on the page.
         at: Which one the page opens on.
     """

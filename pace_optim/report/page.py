@@ -14,6 +14,30 @@ from pace_actuators.files import write_atomically
 from .markup import ENVIRONMENT, Section
 from .run_data import RunData
 from .sections import SECTIONS
+from .sections.replay import replay
+
+
+def write_replay(folder: str | Path, output: Path | None = None) -> Path:
+    """Write ``replay.html`` of a run: one file that opens offline.
+
+    Args:
+        output: The file; ``None``: in the run's folder.
+
+    Returns:
+        The file.
+    """
+    folder = Path(folder)
+    run = RunData.load(folder)
+    run.model()
+    section = replay(run)
+    if section is None:
+        raise ValueError(
+            f"{folder / 'best_trajectory.pt'} does not exist: the fit that made {folder} has not ended. Resume it."
+        )
+    path = output or folder / "replay.html"
+    write_atomically(path, lambda file: file.write(render(run, [section], figures=False).encode()))
+    return path
+
 
 _POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
 """Makes the browser refuse all that is not in the page itself."""
@@ -27,9 +51,6 @@ def write_report(folder: str | Path) -> Path:
 
     Returns:
         The file.
-
-    Raises:
-        ValueError: If there is no result.
     """
     path = Path(folder) / "report.html"
     text = report_text(folder)
@@ -41,11 +62,7 @@ def report_text(folder: str | Path, new: Mapping[str, Any] | None = None) -> byt
     """The page's content.
 
     Args:
-        folder: The run's folder.
         new: Content of JSON files that are about to be written, by name, instead of the present one.
-
-    Raises:
-        ValueError: If there is no result, or a file is damaged; the message names it.
     """
     run = RunData.load(Path(folder), new)
     return render(run, make_sections(run)).encode()
@@ -55,21 +72,13 @@ def check_folder(folder: str | Path, *, anew: str = "") -> None:
     """Read all that the report of a run is made of, so that damage is reported before the work.
 
     Args:
-        folder: The run's folder.
         anew: The file that the work writes anew, which need not be sound.
-
-    Raises:
-        ValueError: If a file is damaged; the message names it.
     """
     make_sections(RunData.load(Path(folder), {anew: None}))
 
 
 def make_sections(run: RunData) -> list[Section]:
-    """All sections that the run's files are there for.
-
-    Raises:
-        ValueError: If a file that one is about is damaged; the message names it.
-    """
+    """All sections that the run's files are there for."""
     sections = []
     for make, name in SECTIONS.items():
         with run.blaming(name):

@@ -36,7 +36,6 @@ def plot_trajectories(
     Args:
         best_trajectory: The content of ``best_trajectory.pt``.
         joint_types: Whether each joint turns or slides; none: all turn.
-        title: Written before the recording's name.
         make_figure: Makes a figure of a ``figsize`` and ``layout``; ``matplotlib.pyplot.figure`` to see it on screen.
 
     Returns:
@@ -134,9 +133,7 @@ def plot_scores(
     """Draw the score over the iterations of search and refinement; the axis above counts simulated steps.
 
     Args:
-        history: What happened.
         joint_types: Of the joints whose errors are in the score.
-        title: Above everything.
         make_figure: Makes a figure of a ``figsize`` and ``layout``; ``matplotlib.pyplot.figure`` to see it on screen.
     """
     figure = make_figure(figsize=(9.0, 5.0), layout=_tight_layout())

@@ -71,11 +71,7 @@ class RunData:
         """Read a run's folder.
 
         Args:
-            folder: The folder.
             new: Content of JSON files that are about to be written, by name, instead of the present one.
-
-        Raises:
-            ValueError: If it has no result, or a file is damaged.
         """
         result = FitResult.load(folder)
         trajectory = read_trajectory(folder) if os.path.lexists(folder / "best_trajectory.pt") else {}
@@ -99,11 +95,7 @@ class RunData:
         )
 
     def read_model(self) -> mujoco.MjModel | None:
-        """The compiled model that the run was made with, ``None`` if the folder does not hold it.
-
-        Raises:
-            ValueError: If it is damaged, or of another version of MuJoCo.
-        """
+        """The compiled model that the run was made with, ``None`` if the folder does not hold it."""
         path = self.folder / "model.mjb"
         if not path.is_file():
             return None
@@ -117,11 +109,7 @@ class RunData:
                 raise ValueError(f"{path} is damaged, or of another version of MuJoCo ({why}). Remove it.") from error
 
     def model(self) -> mujoco.MjModel:
-        """The compiled model that the run was made with.
-
-        Raises:
-            ValueError: If the folder does not hold it.
-        """
+        """The compiled model that the run was made with."""
         model = self.read_model()
         if model is None:
             raise ValueError(f"{self.folder} holds no compiled model to draw; an older version made it. Fit again.")
@@ -133,11 +121,7 @@ class RunData:
 
     @contextlib.contextmanager
     def blaming(self, name: str | None) -> Iterator[None]:
-        """Report what fails in the block as damage of a file; ``None``: of no file.
-
-        Raises:
-            ValueError: What failed; the message names the file.
-        """
+        """Report what fails in the block as damage of a file; ``None``: of no file."""
         try:
             yield
         except (LookupError, TypeError, AttributeError, ArithmeticError, ValueError) as error:

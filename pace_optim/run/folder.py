@@ -106,11 +106,8 @@ class RunFolder:
         """Everything that is known before the first simulation.
 
         Args:
-            settings: Of the fit.
             digests: SHA-256 of each recording.
-            problem: What is fitted.
             inputs: SHA-256 of each other file that was read; ``None`` where there was none.
-            environment: Where the environment comes from.
         """
         write_model(problem, self.path / "model.mjb")
         content: dict[str, Any] = {
@@ -177,11 +174,7 @@ class RunFolder:
             pass
 
     def read_checkpoint(self) -> dict[str, np.ndarray]:
-        """What :meth:`write_checkpoint` wrote.
-
-        Raises:
-            ValueError: If it does not exist, or is damaged.
-        """
+        """What :meth:`write_checkpoint` wrote."""
         path = self.path / "checkpoint.npz"
         if not path.exists():
             raise ValueError(f"{self.path} has no checkpoint.npz: it cannot be resumed. {_ANEW}")
@@ -200,11 +193,7 @@ class RunFolder:
         return arrays
 
     def history_of(self, checkpoint: dict[str, np.ndarray]) -> History:
-        """The scores up to a checkpoint: ``history.json`` may be of one moment later.
-
-        Raises:
-            ValueError: If they are damaged.
-        """
+        """The scores up to a checkpoint: ``history.json`` may be of one moment later."""
         where = f"{self.path / 'checkpoint.npz'}: scores"
         try:
             content = json.loads(str(checkpoint["scores"]))

@@ -29,11 +29,7 @@ class History:
 
     @classmethod
     def load(cls, path: Path) -> History:
-        """Read ``history.json``.
-
-        Raises:
-            ValueError: If it is missing or damaged.
-        """
+        """Read ``history.json``."""
         cure = "Fit again, or go on with the run: it is written anew."
         history = checked(cls, read_json(path, cure), path, cure)
         for stage in ("search", "refine"):

@@ -257,10 +257,7 @@ def make_result(
     """Put a result together.
 
     Args:
-        problem: What was fitted.
         x: The best normalised vector, (size,).
-        residuals: Of x on all samples.
-        uncertainty: At x.
         facts: The remaining fields of :class:`FitResult`.
     """
     data, space = problem.dataset, problem.space
@@ -319,7 +316,6 @@ def assumptions(problem: Problem, shown: Container[str] = ()) -> list[str]:
     """What a fit assumes of the robot, and how its recordings were read, in sentences.
 
     Args:
-        problem: What is fitted.
         shown: Notes that were printed already: they are omitted.
     """
     of_robot = [*problem.env_cfg.sim2real.notes, *problem.measured.notes, *problem.torque_notes]

@@ -8,9 +8,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pace_actuators.files import checked, read_json, refuse
+from pace_actuators.files import checked, read_json
 from pace_actuators.own_code import absolute_reference
-from pace_envs.task_source import EnvironmentRecord
 from pace_optim.problem.unknown_facts import check_unknown
 from pace_optim.recording import without_fact_files
 from pace_optim.terminal.choices import OPTIMIZERS
@@ -121,11 +120,7 @@ class FitSettings:
     """The run of positions alone that this one, with torques, replaces if it is better; ``None`` replaces no run."""
 
     def __post_init__(self) -> None:
-        """Check what can be checked without reading anything, and leave out the JSON files beside recordings.
-
-        Raises:
-            ValueError: If a value is unusable.
-        """
+        """Check what can be checked without reading anything, and leave out the JSON files beside recordings."""
         if isinstance(self.optimizer, type):
             self.optimizer = f"{self.optimizer.__module__}:{self.optimizer.__qualname__}"
         if self.optimizer not in OPTIMIZERS and ":" not in self.optimizer:
@@ -187,10 +182,6 @@ class FitSettings:
         cure = "Start a new fit."
         content = checked(SettingsFile, read_json(path, cure), path, cure)
         settings = checked(cls, content.settings, f"{path}: settings", cure, strict=True)
-        try:
-            EnvironmentRecord.read(content.environment, settings.task)
-        except TypeError as error:
-            refuse(path, str(error), cure)
         return settings, content
 
 

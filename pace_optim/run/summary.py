@@ -62,8 +62,6 @@ def next_line(result: FitResult, folder: Path, *, compared: bool = False) -> lis
     """The command that comes after a fit, by how far its error is above the noise; none if the noise is unknown.
 
     Args:
-        result: Of the fit.
-        folder: Of the run.
         compared: Whether the run has been compared with its recordings.
     """
     if result.times_noise is None:

@@ -46,7 +46,6 @@ class TensorBoardLog:
         """Prepare; the events' file appears with the first event.
 
         Args:
-            folder: Where to write.
             histogram_interval: Generations between two histograms of the parameters, which take most of the time.
         """
         self.folder = folder
@@ -102,7 +101,6 @@ class TensorBoardLog:
         """Log an iteration of the refinement.
 
         Args:
-            iteration: Its number.
             score: Best score so far [rad²].
         """
         self._writer.add_scalar("refinement/score", score, iteration)

@@ -18,20 +18,22 @@ _LARGEST = 1e15
 _SERIES = ("des_dof_pos", "dof_pos", "sim_dof_pos")
 
 
+def existing(path: Path) -> Path:
+    """The path of a file that a fit writes at its end."""
+    if not os.path.lexists(path):
+        raise ValueError(
+            f"{path.parent} has no {path.name} yet: the fit has not ended. Wait, or go on with "
+            f"scripts/fit.py --resume {shlex.quote(str(path.parent))}"
+        )
+    return path
+
+
 def read_trajectory(folder: Path) -> dict[str, Any]:
     """What ``best_trajectory.pt`` holds: ``joint_names``, and ``recordings`` with their series of K samples.
 
     Where the simulation has diverged, ``sim_dof_pos`` is NaN.
-
-    Raises:
-        ValueError: If it is missing or damaged; the message names the key.
     """
-    path = folder / "best_trajectory.pt"
-    if not os.path.lexists(path):
-        raise ValueError(
-            f"{folder} has no {path.name} yet: the fit has not ended. Wait, or go on with "
-            f"scripts/fit.py --resume {shlex.quote(str(folder))}"
-        )
+    path = existing(folder / "best_trajectory.pt")
     content = _dict(read_tensors(path, _ANEW), path, ("joint_names", "recordings"))
     names, recordings = content["joint_names"], content["recordings"]
     if not (isinstance(names, list) and names and all(isinstance(name, str) for name in names)):
@@ -74,11 +76,7 @@ def _check_recording(entry: Any, where: str, joints: int) -> None:
 
 
 def read_bounds(folder: Path) -> dict[str, tuple[float, float]]:
-    """Lower and upper bound by label ``<parameter>/<joint>``, from ``config.pt``; empty without that file.
-
-    Raises:
-        ValueError: If it is damaged.
-    """
+    """Lower and upper bound by label ``<parameter>/<joint>``, from ``config.pt``; empty without that file."""
     path = folder / "config.pt"
     if not os.path.lexists(path):
         return {}
@@ -94,11 +92,7 @@ def read_bounds(folder: Path) -> dict[str, tuple[float, float]]:
 
 
 def read_mean(path: Path) -> torch.Tensor:
-    """A mean of the search, (size,).
-
-    Raises:
-        ValueError: If the file is missing or damaged.
-    """
+    """A mean of the search, (size,)."""
     content = read_tensors(path, "Name another mean, or fit again.")
     if not _is_series(content, 1):
         refuse(path, "holds no vector of finite numbers", "Name another mean, or fit again.")

@@ -99,9 +99,6 @@ def replay_in_training(run: str | Path, cfg: ManagerBasedEnvCfg | None = None) -
         run: The fit's folder, or its ``result.json``.
         cfg: The training environment; it is not changed. ``None`` means that of the identification, with the drives
             as a training would have them.
-
-    Raises:
-        ValueError: If a recording has gone, or the environment's robot is another.
     """
     opened = Run.open(run)
     folder, settings, fitted_cfg = opened.folder, opened.settings, opened.load_cfg()

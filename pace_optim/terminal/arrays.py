@@ -16,12 +16,7 @@ def read_arrays(path: str | Path, cure: str) -> dict[str, np.ndarray]:
     """The arrays that ``numpy.savez`` wrote; no objects.
 
     Args:
-        path: The file.
         cure: What to do if it is missing or damaged, a sentence.
-
-    Raises:
-        ValueError: If it is missing or damaged, holds objects, or an array larger than its data; the message names the
-            array.
     """
     path = file_at(path, cure)
     key = ""

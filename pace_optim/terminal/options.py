@@ -24,6 +24,11 @@ def number(text: str) -> float:
     return value
 
 
+def add_several(parser: argparse._ActionsContainer, name: str, metavar: str, text: str, **more: Any) -> None:
+    """An option that takes one value or more."""
+    parser.add_argument(name, nargs="+", default=[], metavar=metavar, help=text, **more)
+
+
 def add_device_option(parser: argparse.ArgumentParser, needs: str = "pace-mujoco[gpu]") -> None:
     """Where a command simulates, and what a GPU needs."""
     parser.add_argument(
@@ -59,29 +64,19 @@ def add_common_options(parser: argparse.ArgumentParser, *, run: bool = False, re
     """Options of every command that has to do with a robot.
 
     Args:
-        parser: The command's parser.
         run: Whether the command works on runs, which know their robot.
         required: Whether there is no way without ``--task``.
     """
     default = "default: the run's own" if run else "pace list-envs lists them"
     parser.add_argument("--task", required=required, help=f"{_TASK} ({default})")
-    parser.add_argument(
-        "--import",
-        dest="imports",
-        nargs="+",
-        default=[],
-        metavar="MODULE",
-        help="import these modules or files of yours first: code that a run names and has no record of",
-    )
+    imports = "import these modules or files of yours first: code that a run names and has no record of"
+    add_several(parser, "--import", "MODULE", imports, dest="imports")
 
 
 def take_common_options(options: dict[str, Any]) -> dict[str, Any]:
     """Import what the user named by these options; returns them without those that have had their effect.
 
     ``effects``, if the command has it, may name code of the user's own too.
-
-    Raises:
-        ValueError: If something that was named cannot be imported.
     """
     from pace_actuators.effects import import_effect
     from pace_actuators.own_code import import_named

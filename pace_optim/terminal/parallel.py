@@ -43,7 +43,6 @@ def parallel_map(
 
     Args:
         work: Gives one result per item, in order.
-        items: What there is to do.
         effects: The effect of each item; items of one effect stay together. ``None``: each item is on its own.
 
     Raises:

@@ -40,11 +40,7 @@ class Processes:
         return number % self.count == self.rank
 
     def exchange(self, pieces: Sequence[Any]) -> list[Any]:
-        """All pieces, each from the process that owns its number.
-
-        Raises:
-            ValueError: If another process is lost.
-        """
+        """All pieces, each from the process that owns its number."""
         if self.count == 1:
             return list(pieces)
         own = [piece if self.owns(number) else None for number, piece in enumerate(pieces)]
@@ -53,11 +49,7 @@ class Processes:
         return [every[number % self.count][number] for number in range(len(own))]
 
     def gather(self, mine: torch.Tensor, size: int) -> torch.Tensor:
-        """All rows (size, ...) of which each process has its share.
-
-        Raises:
-            ValueError: If another process is lost.
-        """
+        """All rows (size, ...) of which each process has its share."""
         if self.count == 1:
             return mine
         whole = torch.zeros((size, *mine.shape[1:]), dtype=mine.dtype)
@@ -66,11 +58,7 @@ class Processes:
         return whole
 
     def agree(self, value: Any) -> Any:
-        """What the writing process has, in all of them.
-
-        Raises:
-            ValueError: If another process is lost.
-        """
+        """What the writing process has, in all of them."""
         if self.count == 1:
             return value
         held = [value]
@@ -83,9 +71,6 @@ def join(device: str = "cpu") -> tuple[Processes, str]:
 
     Args:
         device: ``"cpu"``, or ``"cuda"`` with any number: each process takes the GPU of its local rank.
-
-    Raises:
-        ValueError: If the others cannot be reached.
     """
     count = int(os.environ.get("WORLD_SIZE", "1"))
     if count == 1:

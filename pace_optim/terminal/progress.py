@@ -53,7 +53,6 @@ class ProgressLine:
         """Update the line. It states no remaining time: when an optimizer converges is not known.
 
         Args:
-            phase: What runs.
             done: Iterations so far in this phase.
             total: Most iterations in this phase.
             error: Smallest error so far in this phase, with its unit.

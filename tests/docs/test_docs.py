@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 from command_lines import run_script
+from effect_list import page as page_of_effects
 from other_simulators import isaaclab_wheel, others_python
 from places import ROOT, SUPPORT
 from torque_sequence import write_result
 from warm_python import WarmPython
 
-from pace_actuators.effects.__main__ import page as page_of_effects
 from pace_optim.export import export
 
 FENCE = re.compile(r"^```(bash|python)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
@@ -71,7 +71,8 @@ def test_the_tutorial_for_an_own_robot_works_when_typed(warm, tmp_path):
 
 @pytest.mark.slow
 def test_the_tutorial_for_an_own_objective_works_when_typed(warm, tmp_path):
-    type_in(warm, "your_own_objective.md", tmp_path, ROOT, {"--duration 2": "--duration 1"})
+    shorter = {"--duration 2": "--duration 1", "--max_iteration 10": "--max_iteration 4"}
+    type_in(warm, "your_own_objective.md", tmp_path, ROOT, shorter)
 
 
 @pytest.mark.slow
@@ -108,7 +109,7 @@ def test_the_notebook_runs_from_top_to_bottom(warm, tmp_path):
 
 def test_the_page_of_effects_is_that_of_the_registry():
     assert (ROOT / "docs" / "effects.md").read_text(encoding="utf-8") == page_of_effects(), (
-        "Write it anew: python -m pace_actuators.effects > docs/effects.md"
+        "Write it anew: python docs/site/effect_list.py > docs/effects.md"
     )
 
 

@@ -6,10 +6,10 @@ import subprocess
 import sys
 
 import pytest
+from effect_page import effect_page
 from places import ROOT
 
 from pace_actuators.effects import available_effects, get_effect
-from pace_actuators.effects.pages import effect_page
 from pace_optim.data_collection.plant import EFFECTS
 
 LOADED = re.compile(r"<(?:script|img|iframe|link)\b[^>]*?\b(?:src|href)=[\"']?(https?:)?//[^\s\"'>]+")

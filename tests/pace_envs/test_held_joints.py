@@ -173,7 +173,7 @@ def test_a_run_knows_where_its_joints_were_held(duo, tmp_path):
 def test_a_record_whose_joints_are_held_at_no_number_is_damaged(duo):
     problem = duo({LEFT: MOTION})
     content = EnvironmentRecord.of(problem.task, problem.env_cfg).to_dict() | {"held_joints": {WAIST: "here"}}
-    with pytest.raises(TypeError, match="held_joints"):
+    with pytest.raises(ValueError, match=f"environment: held_joints/{WAIST} is 'here', expected a finite number"):
         EnvironmentRecord.read(content, problem.task)
 
 

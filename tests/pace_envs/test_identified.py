@@ -18,7 +18,7 @@ from pace_actuators import IdentifiedDrives, PaceDCMotor, PaceDCMotorCfg
 from pace_actuators.drive_result import DriveResult
 from pace_actuators.effects import get_effect
 from pace_actuators.effects.fading_friction import solver_parameters, step_of_constraint
-from pace_actuators.identified_draws import draw, labels_with_std
+from pace_actuators.identified import draw, labels_with_std
 from pace_actuators.representable import HERE, ISAACLAB, MJLAB, World, check_representable, refuse_inertia
 from pace_envs import ManagerBasedRLEnv, TerrainCfg, load_env_cfg, set_physics_dt
 from pace_envs.identified import doubts, set_identified_step, set_step, use_identified
@@ -349,7 +349,7 @@ def test_every_environment_gets_drives_of_its_own(result):
 # ---- training, and the recording in the training environment ---------------------------------------------------------
 
 
-def test_a_training_keeps_its_drives(result, tmp_path):
+def test_a_training_keeps_its_drives(result, tmp_path, no_export):
     settings = RunSettings(
         task=WALK, num_envs=4, max_iterations=1, identified=str(result), randomize_identified=1.0, log_dir=str(tmp_path)
     )

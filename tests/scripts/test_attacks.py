@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from pace_actuators.files import OwnFolder
-from pace_actuators.trusted_code import is_trusted
+from pace_actuators.own_code import is_trusted
 from pace_envs.compiler import host, host_kernels
 from pace_envs.from_model.writing import configuration_text
 from pace_envs.generated_python import Call, Word, python_page

@@ -16,7 +16,7 @@ from run_folders import write_run
 from pace_actuators.files import write_json, write_tensors
 from pace_envs import load_env_cfg
 from pace_optim.problem.parameter_space import ParameterSpace
-from pace_optim.run.replay import replay
+from pace_optim.run.open import replay
 from pace_optim.run.settings import FitSettings
 
 OLD, NEW = "26_01_01_00-00-00", "26_02_01_00-00-00"

@@ -155,9 +155,7 @@ class PaceCfg(Config):
         """Replace bounds of a parameter; ``None`` keeps them.
 
         Args:
-            name: The parameter.
             lower: A number, or one per joint.
-            upper: The same.
         """
         low, high = self.bounds[name].unbind(dim=1)
         given = ((low, lower), (high, upper))
@@ -200,11 +198,7 @@ def _of_joints(values: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any
 
 
 def _of_pace(bounds: Any, joints: int) -> dict[str, torch.Tensor]:
-    """PACE's tensor of bounds, (4n+1, 2), by name.
-
-    Raises:
-        ValueError: If it has another shape.
-    """
+    """PACE's tensor of bounds, (4n+1, 2), by name."""
     rows = torch.as_tensor(bounds, dtype=torch.float64)
     counts = [1 if parameter.shared else joints for parameter in BASE_PARAMETERS.values()]
     if tuple(rows.shape) != (sum(counts), 2):
@@ -218,11 +212,7 @@ def _of_pace(bounds: Any, joints: int) -> dict[str, torch.Tensor]:
 
 
 def _by_name(bounds: Mapping[str, Any], joints: Sequence[str]) -> dict[str, torch.Tensor]:
-    """Bounds of every base parameter, {name: (n, 2)}, of the shared ones (1, 2).
-
-    Raises:
-        ValueError: If a name is missing or unknown, or a lower bound is above the upper one.
-    """
+    """Bounds of every base parameter, {name: (n, 2)}, of the shared ones (1, 2)."""
     if set(bounds) != set(BASE_PARAMETERS):
         raise ValueError(
             f"bounds has {', '.join(bounds) or 'nothing'}, expected a pair (lower, upper) for each of "

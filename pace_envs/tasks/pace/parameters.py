@@ -231,13 +231,8 @@ def sought_links(model: mujoco.MjModel, joints: Sequence[str], wanted: Sequence[
     """The links whose inertial parameters are to be identified.
 
     Args:
-        model: The robot's model.
-        joints: The driven joints.
         wanted: Regular expressions of links' names, each as ``NAME``, or ``NAME@mass,com,inertia,load`` with some of
             these.
-
-    Raises:
-        ValueError: If an expression matches nothing, a part is unknown, or a link does not move or has no mass.
     """
     named = [model.body(b).name for b in range(1, model.nbody) if model.body(b).name]
     moving = {name: moved_by(model, name, joints) for name in named}

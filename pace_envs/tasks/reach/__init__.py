@@ -1,6 +1,5 @@
 """An arm brings its hand to commanded places."""
 
-from pace_envs.tasks.reach.reach_env_cfg import ReachEnvCfg, reach_env_cfg
-from pace_envs.tasks.reach.terms import ReachCommand, ReachCommandCfg
+from pace_envs.tasks.reach.reach_env_cfg import ReachCommand, ReachCommandCfg, ReachEnvCfg, reach_env_cfg
 
 __all__ = ["ReachCommand", "ReachCommandCfg", "ReachEnvCfg", "reach_env_cfg"]

@@ -2,8 +2,7 @@
 
 from pace_envs.rsl_rl_cfg import play_cfg, use_rewards
 from pace_envs.tasks.velocity.options import add_randomization, fix_command, set_drives
-from pace_envs.tasks.velocity.rewards import energy_rewards, velocity_rewards
-from pace_envs.tasks.velocity.velocity_env_cfg import VelocityEnvCfg, velocity_env_cfg
+from pace_envs.tasks.velocity.velocity_env_cfg import VelocityEnvCfg, energy_rewards, velocity_env_cfg, velocity_rewards
 
 __all__ = [
     "VelocityEnvCfg",

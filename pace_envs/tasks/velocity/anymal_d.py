@@ -4,8 +4,7 @@ from dataclasses import replace
 
 from pace_envs.robots import anymal_d_cfg
 from pace_envs.rsl_rl_cfg import RslRlOnPolicyRunnerCfg, gaussian
-from pace_envs.tasks.velocity.rewards import energy_rewards, velocity_rewards
-from pace_envs.tasks.velocity.velocity_env_cfg import VelocityEnvCfg, velocity_env_cfg
+from pace_envs.tasks.velocity.velocity_env_cfg import VelocityEnvCfg, energy_rewards, velocity_env_cfg, velocity_rewards
 
 COPPER_LOSS = 0.008
 """R / (r² k²) [W/(N m)²]: R 0.2 ohm, r 50, k 0.1 N m/A. Assumed, of the right size; put in your motor's."""

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 from pace_envs.robots import go2_cfg
 from pace_envs.rsl_rl_cfg import RslRlOnPolicyRunnerCfg
-from pace_envs.tasks.velocity.rewards import energy_rewards, velocity_rewards
-from pace_envs.tasks.velocity.velocity_env_cfg import VelocityEnvCfg, velocity_env_cfg
+from pace_envs.tasks.velocity.velocity_env_cfg import VelocityEnvCfg, energy_rewards, velocity_env_cfg, velocity_rewards
 
 COPPER_LOSS = {".*_(hip|thigh)_joint": 0.45, ".*_calf_joint": 0.2}
 """R / (r² k²) [W/(N m)²]: R 0.3 ohm, k 0.128 N m/A, r 6.33 and 9.6. Assumed, of the right size; put in your motor's."""

@@ -29,8 +29,6 @@ def add_randomization(
     """Train over many grounds and loads, with pushes.
 
     Args:
-        cfg: The task.
-        friction_range: Sliding friction of the feet.
         mass_range: Mass that is added to the base [kg].
         push_speed: Largest change of the base's velocity by a push, forward and sideways [m/s].
         push_interval_s: Time between pushes [s].

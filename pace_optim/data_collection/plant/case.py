@@ -69,11 +69,7 @@ class CaseFiles:
 
 
 def make_case(case: Case) -> tuple[Suite, Drawn]:
-    """Draw a case and simulate its recordings.
-
-    Raises:
-        ValueError: If an effect is unknown or stays invisible.
-    """
+    """Draw a case and simulate its recordings."""
     for name in case.effects:
         effect_named(name)
     if case.background and not (case.effects or case.harmonic_drive):

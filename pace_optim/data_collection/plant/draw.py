@@ -66,11 +66,7 @@ def draw_base(robot: PlantRobot, rng: np.random.Generator) -> BaseTruth:
 
 
 def joints_of(robot: PlantRobot, pattern: str) -> tuple[str, ...]:
-    """The joints that a regular expression names.
-
-    Raises:
-        ValueError: If there is no such joint.
-    """
+    """The joints that a regular expression names."""
     try:
         names = tuple(name for name in robot.joint_names if re.fullmatch(pattern, name))
     except re.error as error:
@@ -86,9 +82,7 @@ def draw_effect(
     """An effect's parameters, the same on all its joints: {parameter: {joint: value}}.
 
     Args:
-        name: The effect.
         robot: The robot, whose strength scales torques.
-        rng: Source of randomness.
         joints: Which joints have it; None for all.
         boost: Above 1, it is larger than its range says.
     """
@@ -126,17 +120,10 @@ def draw_visible(
     itself), are drawn again; each round sizes grow, so that effects that this robot hides still end visible.
 
     Args:
-        robot: The robot.
-        runs: Its recordings.
         names: The effects; none for the base alone.
-        rng: Source of randomness.
-        cfg: The plant.
         base: The truth to add to; None draws one.
         joints: Which joints have the effects, a regular expression.
         smallest: Smallest change that counts as visible [rad]; None for three times the noise.
-
-    Raises:
-        ValueError: If an effect is unknown, or stays invisible.
     """
     cfg = cfg or PlantCfg()
     where = joints_of(robot, joints)
@@ -202,13 +189,8 @@ def with_background(
     Their sizes are drawn, then scaled by one factor that three or four simulations find.
 
     Args:
-        robot: The robot.
-        runs: Its recordings.
-        drawn: What to add to.
-        rng: Source of randomness.
         size: RMS change of the motion by all of them together [rad].
         count: How many, at most.
-        cfg: The plant.
     """
     cfg = cfg or PlantCfg()
     others = [n for n in library_effects() if n not in drawn.truth.effects and n not in _NOT_IN_BACKGROUND]

@@ -30,9 +30,6 @@ class Dynamics:
         """Start at rest.
 
         Args:
-            drives: Constants.
-            body: The links.
-            effects: What is hidden.
             position: Where the encoder's side of each joint is, (R, n) [rad].
         """
         self.drives, self.body = drives, body

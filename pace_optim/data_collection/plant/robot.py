@@ -76,9 +76,6 @@ def plant_robot(task: str, control_dt: float | None = None) -> PlantRobot:
     Args:
         task: As for :func:`pace_envs.load_env_cfg`.
         control_dt: Time between two commands [s], of a model file.
-
-    Raises:
-        ValueError: If the task is unknown or no identification task.
     """
     cfg = load_env_cfg(task, control_dt)
     pace = getattr(cfg, "sim2real", None)

@@ -28,13 +28,8 @@ def simulate_runs(
     encoder at the first target.
 
     Args:
-        task: Identification task, or a robot.
         runs: Commands, gains and loads of each recording; commands of the same length.
-        truth: What is hidden.
         cfg: How the plant is stepped and measured.
-
-    Raises:
-        ValueError: If something does not fit, or the motion diverges.
     """
     return simulate_truths(task, runs, [truth], cfg)[0]
 

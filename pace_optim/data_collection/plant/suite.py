@@ -56,9 +56,6 @@ def make_suite(
     one another without a pause, in this order.
 
     Args:
-        robot: The robot.
-        kind: Which.
-        seed: Of random levels and phases.
         duration: Of each recording [s]; None for the usual.
         known_mass: What is added for one recording, {body: kg}; None for the robot's usual (0.8 kg on the bench,
             0.5 kg on each last link elsewhere).

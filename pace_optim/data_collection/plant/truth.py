@@ -96,12 +96,7 @@ def per_joint(value: PerJoint, joint_names: Sequence[str], default: float, what:
 
     Args:
         value: A number, or {joint or regular expression: number}.
-        joint_names: The joints.
         default: Value of joints that no key covers.
-        what: Its name, for messages.
-
-    Raises:
-        ValueError: If a key covers no joint.
     """
     if not isinstance(value, Mapping):
         return np.full(len(joint_names), float(value))

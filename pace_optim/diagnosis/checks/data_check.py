@@ -19,8 +19,8 @@ from pace_optim.joints.simulation.problem import TwinProblem
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.step_error import step_error
 from pace_optim.recording import Recording
+from pace_optim.recording.dataset import session_starts
 from pace_optim.recording.noise import lattice_step, noise_floor
-from pace_optim.recording.sessions import session_starts
 from pace_optim.run.result import FitResult
 
 

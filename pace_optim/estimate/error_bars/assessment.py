@@ -51,8 +51,6 @@ class Assessment:
 
         Args:
             problem: What was fitted, or the same with other facts.
-            evaluator: Simulates all its recordings.
-            training: Simulates what is trained on.
             x: The vector, normalised (size,).
             held: Labels of what is held where it is.
         """
@@ -75,9 +73,6 @@ def assess(
     descent ended early, and x goes on to the minimum here.
 
     Args:
-        problem: What was fitted.
-        evaluator: Simulates all recordings.
-        colouring: Which entries are perturbed together.
         x: Normalised, (size,).
         ended: What ended there or near it, which knows the principal directions; ``None``: they are looked for.
         training: Simulates what is trained on; ``None``: the problem's own.
@@ -145,7 +140,6 @@ def _middle_of_swings(jacobian: Jacobian, phases: FreePhases, trained: torch.Ten
     with its own variance (Liang and Zeger, Biometrika 73, 1986).
 
     Args:
-        jacobian: On the training samples.
         phases: What is not known of swings.
         trained: Where these samples are, (T, R) bool.
     """
@@ -180,9 +174,6 @@ def _late_forces(jacobian: Jacobian, evaluator: Evaluator, space: ParameterSpace
     of which no log shows τ. A simulator whose step h is semi-implicit logs positions that are h / 2 ahead.
 
     Args:
-        jacobian: On the training samples.
-        evaluator: Simulates these recordings.
-        space: The parameters.
         x: Normalised, (size,).
     """
     rollout, physical, slope = evaluator.rollout(1), space.to_physical(x), space.slope(x)
@@ -241,7 +232,6 @@ def make_probes(
         x: Normalised vector, (size,).
         around: Vectors around x that give the derivatives.
         trees: Groups of joints that do not influence each other.
-        joint_names: All joints, in order.
         shake: How far first positions are moved [rad].
     """
     moved, joints = _shaken(trees, joint_names, shake)

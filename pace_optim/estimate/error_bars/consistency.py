@@ -62,11 +62,9 @@ def check_consistency(
     """Fit each training recording alone, from the joint result, and compare beyond the error bars.
 
     Args:
-        problem: The joint problem.
         x: Its result, normalised (size,).
         score: Its score [rad²].
         there: Residuals and derivatives at x on the training samples; ``None``: they are simulated.
-        report: Gets a line of progress.
     """
     trained = problem.dataset.trained()
     problem = replace(problem, dataset=problem.dataset.select(trained))

@@ -17,7 +17,6 @@ def times_noise(problem: Problem, rmse: float | None) -> float | None:
     """An RMSE of all joints [rad] as a multiple of the recordings' noise; ``None`` without noise.
 
     Args:
-        problem: What was fitted.
         rmse: Of all joints [rad].
     """
     noise = (_of_positions(problem) / len(problem.joint_names)) ** 0.5
@@ -50,7 +49,6 @@ def far_end(times: float | None, rmse: float, optimizer: str, joint_types: Seque
     Args:
         times: Its error as a multiple of the noise.
         rmse: Its error [rad].
-        optimizer: What ended there.
         joint_types: Whether each joint turns or slides; none: all turn.
     """
     if times is None or times < FAR_ABOVE_NOISE:

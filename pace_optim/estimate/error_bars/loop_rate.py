@@ -103,7 +103,6 @@ class LoopRates:
         """The same about a result: the chosen period's values are the result's, and the others' as far away as here.
 
         Args:
-            space: The parameters.
             physical: The result, (size,).
         """
         moved = self.values + (physical - self.value_at(self.chosen))
@@ -122,7 +121,6 @@ class LoopRates:
         """The warning about the rate.
 
         Args:
-            space: The parameters.
             known: Which of them have an error bar, (size,) bool.
         """
         used, other = self.chosen, self.farthest
@@ -244,10 +242,7 @@ def _refitted(
     """A fit with another period from x, first by known derivatives; ``None`` where it diverges.
 
     Args:
-        other: With that period.
-        problem: What was fitted.
         x: Where it begins, normalised (size,).
-        there: Of the fit.
         phases: What the residuals have taken out of free phases.
     """
     evaluator, space = other.evaluator_like(problem), problem.space

@@ -94,8 +94,6 @@ def estimate_uncertainty(
     Of a walking robot's swings, Σ is known (:mod:`pace_optim.estimate.error_bars.assessment`).
 
     Args:
-        jacobian: At x.
-        space: The parameters.
         x: The optimum, normalised (size,).
         initial: Derivatives of the residuals by the first positions of ``initial_joints``, (sets, K, R, n).
         initial_joints: Joints whose first position was moved together.
@@ -126,9 +124,6 @@ def uncertainty_of(
     Args:
         hessian: H = JᵀJ, normalised (size, size) [rad²].
         middle: JᵀΣJ, normalised (size, size) [rad⁴].
-        samples: Number of samples.
-        colouring: Which joints each entry moves.
-        space: The parameters.
         x: The optimum, normalised (size,).
         held: Labels of what is held where it is.
     """
@@ -316,7 +311,6 @@ def _weak_directions(
         hessian: JᵀJ of some entries, (m, m).
         std: Their standard deviations, normalised (m,).
         entries: Where they are in the full vector, (m,).
-        space: The parameters.
     """
     groups: dict[tuple[str, ...], bool] = {}
     scale = 1 / np.sqrt(hessian.diagonal())
@@ -344,10 +338,6 @@ def torque_noise(residuals: Residuals, torques: Torques) -> list[float]:
         σ² = τᵀΣτ / τᵀτ
 
     leaves it the same. Errors that go on from sample to sample, as a filter makes them, count as the noise of few.
-
-    Args:
-        residuals: Of one candidate.
-        torques: What is measured.
     """
     error, known = residuals.torque_errors(torques)
     measured, result = torques.measured[residuals.step], []

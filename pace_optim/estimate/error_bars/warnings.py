@@ -50,9 +50,7 @@ def fit_warnings(
     """Plain sentences, one for each kind; none if all is well.
 
     Args:
-        problem: What was fitted.
         physical: The result, (size,).
-        uncertainty: At the result.
         rmse: Errors as in ``result.json``.
         left_open: Labels of parameters that the recordings do not determine, at their prior.
         unsure: Labels of those that are not determined either, but fit worse there.

@@ -23,8 +23,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from pace_actuators.identified import DRIVE_FIELDS
-from pace_optim.problem.bounded_least_squares import bounded_least_squares
-from pace_optim.problem.inverse_dynamics import LinkMotion, frame_motion, model_of
+from pace_optim.problem.inverse_dynamics import LinkMotion, bounded_least_squares, frame_motion, model_of
 from pace_optim.problem.moving_base import joints_of_feet
 from pace_optim.problem.problem import Problem
 from pace_optim.recording.moving_base import standing_feet
@@ -210,7 +209,6 @@ class Links:
         """Of a recording.
 
         Args:
-            view: The recording.
             before: Of the same recording otherwise; joints that move alike under the same gravity are looked at once.
         """
         position = view.smooth(view.position)
@@ -264,9 +262,6 @@ def balances(view: View, links: Links, joints: Iterable[int], further: np.ndarra
     """The balance of some joints, without those that hardly move.
 
     Args:
-        view: The recording.
-        links: Of its motion.
-        joints: By index.
         further: Torques that may have any part in each joint's, (N, n, m) [N m].
     """
     result, counts = {}, moving(view, links)

@@ -690,11 +690,7 @@ def checked(problem: Problem, trust: bool = False) -> Problem:
     """The problem with what is wrong with its log among its contradictions, and with IMUs that are late in time.
 
     Args:
-        problem: What is to be fitted.
         trust: Whether a log that no fit can be right of is only warned of.
-
-    Raises:
-        ValueError: If no fit of the log can be right.
     """
     found = check_log(problem)
     if (wrong := [each.sentence for each in found if each.stops]) and not trust:

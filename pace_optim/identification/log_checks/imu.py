@@ -124,7 +124,6 @@ def stuck_contacts(view: View, is_doubted: Callable[[], list[int]]) -> Iterator[
     """Feet whose contact never changes although their legs move as others do: joints, and what is wrong.
 
     Args:
-        view: The recording.
         is_doubted: Finds the joints that do not balance.
     """
     if view.standing is None or len(view.feet) < 2:

@@ -11,7 +11,7 @@ import torch
 from pace_actuators.base_parameters import BASE_PARAMETERS
 from pace_actuators.effects import PROBED_STIFFNESS, Effect, EffectParameter
 from pace_optim.estimate.error_bars.uncertainty import AT_BOUND
-from pace_optim.problem.box import Box
+from pace_optim.problem.parameter_space import Box
 from pace_optim.problem.problem import Problem
 
 BASE = tuple(BASE_PARAMETERS)

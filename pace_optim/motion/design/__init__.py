@@ -5,11 +5,9 @@ r"""Choosing a motion before any hardware moves: the one after which the paramet
 >>> print(*design_table(design), sep="\n")
 """
 
-from .criterion import expected_uncertainty, mean_log_error
-from .design import Design, DesignCfg, optimize_motion
-from .information import Information
+from .design import Design, DesignCfg, design_table, optimize_motion
+from .information import Information, expected_uncertainty, mean_log_error
 from .joint_motion import JointMotion, Room, command
-from .table import design_table
 
 __all__ = [
     "Design",

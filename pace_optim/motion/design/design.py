@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
-from pace_actuators.joint_units import JointType
-from pace_envs.tasks.pace import PaceCfg
+from pace_actuators.joint_units import JointType, units_for
+from pace_envs.tasks.pace import GLOBAL, PaceCfg
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty
+from pace_optim.estimate.error_bars.warnings import in_words
 from pace_optim.motion.design.motion_check import MotionLimits
 from pace_optim.motion.signals import Trajectory
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 
-from .criterion import expected_uncertainty, mean_log_error
-from .information import Information, ProblemOf, information_of
+from .information import Information, ProblemOf, expected_uncertainty, information_of, mean_log_error
 from .joint_motion import JointMotion, command, rooms, within_speed
 
 _SMALLEST_GAIN = 1e-9
@@ -107,17 +108,12 @@ def optimize_motion(
 
     Args:
         problem_of: Makes the robot's problem from trajectories.
-        sim2real: The robot's configuration.
         unoptimized: The motion asked for, made from the same request.
-        limits: The robot's.
         x: Where the parameters are expected to be, normalised (size,).
-        excitation: Which kind of motion.
         min_frequency: Lower end of the widest band [Hz].
         max_frequency: Upper end of the widest band [Hz].
         control_dt: Time between two targets [s].
         duration: Of the trajectory [s]; ``None`` means the excitation's usual one.
-        cfg: Settings of the search.
-        report: Gets a line of progress.
     """
     cfg = cfg or DesignCfg()
     rng = np.random.default_rng([cfg.seed, 2])
@@ -198,3 +194,58 @@ class _Search:
 
     def _value(self, information: Information) -> float:
         return mean_log_error(*information.total(), self.noise, self.free)
+
+
+def design_table(design: Design) -> list[str]:
+    """Expected error bars of every parameter, before and after; how each joint moves; what stays unknown.
+
+    Returns:
+        Its lines.
+    """
+    space = design.space
+    own = [p for p in space.parameters if not p.shared]
+    joints = design.trajectory.joint_names
+    width = max(len(joint) for joint in [*joints, "joint"])
+    titles = [f"{p.name} [{' or '.join(dict.fromkeys(p.units or (p.unit,)))}]" for p in own]
+    columns = [max(len(title), 19) for title in titles]
+    noise = units_for(f"{design.noise:g} rad", design.joint_types)
+    lines = [
+        f"expected error bars (one standard deviation) for encoder noise of {noise}: "
+        f"unoptimised -> optimised, {design.tried} candidates tried",
+        "  ".join(["joint".ljust(width), *(t.rjust(c) for t, c in zip(titles, columns, strict=True)), "  motion"]),
+    ]
+    for j, joint in enumerate(joints):
+        cells = [_change(design, f"{p.name}/{joint}").rjust(c) for p, c in zip(own, columns, strict=True)]
+        lines.append("  ".join([joint.ljust(width), *cells, f"  {_motion(design, j)}"]))
+    lines += [f"{p.name}: {_change(design, f'{p.name}/{GLOBAL}')} {p.unit}" for p in space.parameters if p.shared]
+    before, after = (100 * math.exp(v) for v in (design.criterion_before, design.criterion_after))
+    lines.append(
+        f"geometric mean of the error bars: {before:.3g} % -> {after:.3g} % of the bound range "
+        f"({math.exp(design.criterion_before - design.criterion_after):.2f} times better)"
+    )
+    if design.slowed:
+        lines.append(
+            f"The motion asked for has targets faster than the drive on {', '.join(design.slowed)} (its error bars: "
+            f"{100 * math.exp(design.criterion_asked):.3g} %); unoptimised is the same, smaller where too fast."
+        )
+    return lines + _unknown("unoptimised", design.before) + _unknown("optimised", design.after)
+
+
+def _change(design: Design, label: str) -> str:
+    i = design.space.labels.index(label)
+    return " -> ".join("-" if math.isnan(u.std[i]) else f"{u.std[i]:.2g}" for u in (design.before, design.after))
+
+
+def _motion(design: Design, j: int) -> str:
+    motion = design.joints[j]
+    if motion is None:
+        return "as it was"
+    place = units_for(f"{motion.centre:+.2f} ± {abs(motion.amplitude):.2f} rad", design.joint_types[j : j + 1])
+    return f"{place}, {motion.min_frequency:.2g} to {motion.max_frequency:.2g} Hz"
+
+
+def _unknown(which: str, uncertainty: Uncertainty) -> list[str]:
+    lines = [f"{which}: the recording cannot separate {in_words(group)}." for group in uncertainty.indistinguishable]
+    if uncertainty.no_influence:
+        lines.append(f"{which}: no influence: {', '.join(uncertainty.no_influence)}.")
+    return lines

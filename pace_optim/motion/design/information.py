@@ -10,6 +10,7 @@ import torch
 
 from pace_optim.estimate.derivatives import NARROW, Colouring, colour, stencil
 from pace_optim.estimate.error_bars.assessment import Probes, make_probes
+from pace_optim.estimate.error_bars.uncertainty import Uncertainty, uncertainty_of
 from pace_optim.motion.design.motion_check import MotionFinding, MotionLimits, check_command, check_simulated
 from pace_optim.motion.signals import Trajectory
 from pace_optim.problem.problem import Problem
@@ -56,9 +57,6 @@ def information_of(
     """Simulate trajectories with the parameters x and with their neighbours, all in few batches.
 
     Args:
-        problem_of: Makes the robot's problem.
-        trajectories: Of the same length.
-        limits: The robot's.
         x: Where the parameters are expected to be, normalised (size,).
     """
     problem = problem_of(trajectories[:1])
@@ -131,7 +129,6 @@ def _block(
     Args:
         derivatives: Change of the positions by each colour's step, (colours, T, n) [rad].
         initial: Derivatives by the first positions, (sets, T, n).
-        tree: Its joints.
         step: Signed step of every entry, (size,).
         colouring: Which entries belong to which colour and joints.
     """
@@ -145,3 +142,47 @@ def _block(
     full, middle = np.zeros((size, size)), np.zeros((size, size))
     full[at], middle[at] = hessian.numpy(), (hessian + effect @ effect.T).numpy()
     return full, middle
+
+
+_UNIFORM = 12.0 / 2.0**2
+"""Precision of what is known before: anywhere within the bounds, [-1, 1]."""
+
+
+def mean_log_error(hessian: np.ndarray, middle: np.ndarray, noise: float, free: np.ndarray) -> float:
+    """The criterion: mean over the parameters of log(standard deviation / bound range).
+
+        C = A⁻¹ (M/σ² + P) A⁻¹,   A = H/σ² + P,   criterion = mean_i log(√C_ii / 2)
+
+    in normalised parameters, whose range is 2. P is the precision of a uniform distribution over the bounds (12/range²
+    each): it keeps C finite where a motion says nothing. The exponential of the criterion is the geometric mean of the
+    error bars as shares of the ranges. Such a mean does not depend on units, as the determinant of D-optimality does
+    not, and weighs every parameter's own error bar, as A-optimality does (Atkinson, Donev and Tobias, Optimum
+    Experimental Designs, 2007, ch. 10; with a prior: Chaloner and Verdinelli, Statistical Science 10, 1995).
+
+    Args:
+        hessian: H, (size, size) [rad²].
+        middle: M, (size, size) [rad²].
+        noise: σ [rad].
+        free: Entries that can vary, (size,) bool.
+    """
+    at = np.ix_(free, free)
+    prior = _UNIFORM * np.eye(int(free.sum()))
+    inverse = np.linalg.inv(hessian[at] / noise**2 + prior)
+    variance = np.einsum("ij,jk,ki->i", inverse, middle[at] / noise**2 + prior, inverse, optimize=True)
+    return float(np.mean(np.log(np.sqrt(variance) / 2)))
+
+
+def expected_uncertainty(
+    problem: Problem, hessian: np.ndarray, middle: np.ndarray, noise: float, x: torch.Tensor
+) -> Uncertainty:
+    """The error bars that a fit would state.
+
+    Args:
+        hessian: H, (size, size) [rad²].
+        middle: M, (size, size) [rad²].
+        noise: σ, standard deviation of the encoder's white noise [rad].
+        x: Where the parameters are expected to be, normalised (size,).
+    """
+    samples = int(problem.dataset.sampled.sum())
+    colouring = colour(problem.space, problem.trees, problem.joint_names)
+    return uncertainty_of(hessian, noise**2 * middle, samples, colouring, problem.space, x)

@@ -73,8 +73,6 @@ class Room:
         """A motion near another one.
 
         Args:
-            motion: The other one.
-            rng: Source of randomness.
             width: Standard deviation of the change, as a share of the room and of the band's ends.
         """
         half = (self.upper - self.lower) / 2
@@ -101,10 +99,8 @@ def rooms(
 
     Args:
         cfg: The robot's configuration; its ``excitation`` must not be None.
-        limits: The robot's.
         min_frequency: Lower end of the band [Hz].
         max_frequency: Upper end of the band [Hz].
-        reach: Factor of the range's width.
     """
     excitation = cfg.excitation
     assert excitation is not None  # an unoptimised motion was made from it
@@ -141,11 +137,6 @@ def command(
     """The targets of all joints, each its own motion; faster than its drive, a joint's amplitude is made smaller.
 
     Args:
-        name: Name of the trajectory.
-        excitation: Which kind of motion.
-        cfg: The robot's configuration.
-        joints: One motion per joint.
-        all_rooms: One room per joint.
         control_dt: Time between two targets [s].
         duration: Of the trajectory [s]; ``None`` means the excitation's usual one.
 
@@ -199,7 +190,6 @@ def within_speed(unoptimized: Trajectory, all_rooms: Sequence[Room], control_dt:
 
     Args:
         unoptimized: The motion; it starts at the centre of every joint.
-        all_rooms: One room per joint.
         control_dt: Time between two targets [s].
     """
     if unoptimized.has_jumps:

@@ -69,11 +69,7 @@ def check_command(trajectory: Trajectory, limits: MotionLimits) -> list[MotionFi
     A trajectory that jumps on purpose (steps) has no commanded speed; see ``Trajectory.has_jumps``.
 
     Args:
-        trajectory: The targets.
         limits: The robot's, with the same joints in the same order.
-
-    Raises:
-        ValueError: If the joints differ.
     """
     if trajectory.joint_names != limits.joint_names:
         raise ValueError(
@@ -108,7 +104,6 @@ def check_simulated(
         time: Instants, (T,) [s].
         position: Joint positions, (T, n) [rad].
         torque: Torques applied between two instants, (T - 1, n) [N m].
-        limits: The robot's.
     """
     findings = _beyond_position(position, time, limits, "position", is_error=False)
     for j, joint in enumerate(limits.joint_names):
@@ -143,13 +138,7 @@ def summarise(findings: Sequence[MotionFinding]) -> list[str]:
 
 
 def refuse_errors(findings: Sequence[MotionFinding], name: str, robot: str) -> None:
-    """Raise a ValueError that lists the errors among the findings.
-
-    Args:
-        findings: The findings.
-        name: Name of the trajectory.
-        robot: What to call the robot.
-    """
+    """Raise a ValueError that lists the errors among the findings."""
     errors = [finding.message for finding in findings if finding.is_error]
     if errors:
         more = f" And {len(errors) - 3} more." if len(errors) > 3 else ""

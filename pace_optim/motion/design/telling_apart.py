@@ -87,9 +87,7 @@ def next_experiments(
 
     Args:
         problem: The whole robot with the base model.
-        pairs: Models that cannot be separated.
         noise: Of each joint, (n,) [rad].
-        cfg: The menu.
     """
     cfg = cfg or MenuCfg()
     by_torque = _told(problem) == "torque"
@@ -188,7 +186,6 @@ def distances(
     """RMS difference of two models' predictions on each recording, over the joints of the pair, (R,) [rad] each.
 
     Args:
-        problem: The whole robot.
         pairs: Pairs of models; a model of several pairs is simulated once on the same recordings.
         recordings: What each pair is simulated on.
     """

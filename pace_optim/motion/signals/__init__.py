@@ -13,9 +13,8 @@ A new excitation is one small file in this folder (or anywhere else that is impo
 from importlib import import_module
 from pkgutil import iter_modules
 
-from .motion import Motion
 from .registry import Excitation, excitation_named, excitations, make_excitation, register_excitation
-from .trajectory import Trajectory, write_command_csv
+from .trajectory import Motion, Trajectory, write_command_csv
 
 __all__ = [
     "Excitation",

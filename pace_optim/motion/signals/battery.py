@@ -3,11 +3,10 @@
 import numpy as np
 
 from .chirp import chirp_signal
-from .motion import Motion
 from .ramp import triangle_signal
 from .registry import register_excitation
 from .steps import steps_signal
-from .trajectory import Trajectory
+from .trajectory import Motion, Trajectory
 
 # The largest chirp takes the whole range of the robot's excitation; the others keep their proportion to its 0.8 rad.
 _LARGEST = 0.8  # [rad]

@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from .motion import Motion
 from .registry import register_excitation
-from .trajectory import Trajectory
+from .trajectory import Motion, Trajectory
 
 
 def chirp_signal(motion: Motion) -> np.ndarray:

@@ -10,8 +10,7 @@ import numpy as np
 
 from pace_envs.tasks.pace import PaceCfg
 
-from .motion import Motion
-from .trajectory import Trajectory
+from .trajectory import Motion, Trajectory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,11 +59,7 @@ def excitations() -> tuple[Excitation, ...]:
 
 
 def excitation_named(name: str) -> Excitation:
-    """The excitation of a name.
-
-    Raises:
-        ValueError: If it does not exist.
-    """
+    """The excitation of a name."""
     if name not in _EXCITATIONS:
         close = difflib.get_close_matches(name, _EXCITATIONS, n=1)
         hint = f" Did you mean {close[0]!r}?" if close else ""
@@ -91,7 +86,6 @@ def make_excitation(
 
     Args:
         name: One of ``excitations()``.
-        cfg: The robot's configuration.
         control_dt: Time between two targets [s].
         duration: Duration of each trajectory [s]; ``None`` means the excitation's usual one.
         min_frequency: Lower end of the band [Hz].

@@ -5,12 +5,103 @@ from __future__ import annotations
 import csv
 import io
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from pace_actuators.files import write_atomically
+from pace_envs.tasks.pace import PaceCfg
+
+_MIN_SAMPLES = 20
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Motion:
+    """A request for a motion. An excitation makes signals that stay within ±1 and start at 0; this scales them.
+
+    The target of each joint is
+
+        target = (signal + bias) * direction * scale        (bias, direction, scale: PaceCfg.excitation)
+    """
+
+    cfg: PaceCfg
+    """The robot's configuration; its ``excitation`` must not be None."""
+    duration: float
+    """Duration of one trajectory [s]."""
+    control_dt: float
+    """Time between two targets [s]."""
+    min_frequency: float
+    """Lower end of the band [Hz]."""
+    max_frequency: float
+    """Upper end of the band [Hz]."""
+    rng: np.random.Generator
+    """The only source of randomness."""
+    time: np.ndarray = field(init=False)
+    """Instants, (T,) [s]."""
+    scale: np.ndarray = field(init=False)
+    """Amplitude of a signal of 1, with the sign of its direction, (n,) [rad]."""
+    bias: np.ndarray = field(init=False)
+    """Centre of the motion before scaling, (n,)."""
+
+    def __post_init__(self) -> None:
+        """Check the request and lay out the time base."""
+        excitation, names = self.cfg.excitation, self.cfg.joint_order
+        if excitation is None:
+            raise ValueError(
+                f"{self.cfg.robot_name} has no excitation, so it is not known how far its joints may move. Set "
+                "PaceCfg.excitation = ExcitationCfg(bias=..., direction=..., scale=...), one value per joint."
+            )
+        for key in ("bias", "direction", "scale"):
+            values = getattr(excitation, key)
+            if len(values) != len(names) or not np.all(np.isfinite(values)):
+                raise ValueError(
+                    f"excitation.{key} of {self.cfg.robot_name} is {tuple(values)}; expected {len(names)} finite "
+                    f"numbers, one per joint of joint_order ({', '.join(names)}). Correct the configuration."
+                )
+        self._check_time_and_band()
+        steps = round(self.duration / self.control_dt)
+        object.__setattr__(self, "time", np.arange(steps) * self.control_dt)
+        signed = np.asarray(excitation.direction, dtype=float) * np.asarray(excitation.scale, dtype=float)
+        object.__setattr__(self, "scale", signed)
+        object.__setattr__(self, "bias", np.asarray(excitation.bias, dtype=float))
+
+    @property
+    def num_joints(self) -> int:
+        """Number of joints n."""
+        return len(self.cfg.joint_order)
+
+    def trajectory(self, name: str, signal: np.ndarray, *, has_jumps: bool = False) -> Trajectory:
+        """Scale a signal to the robot.
+
+        Args:
+            signal: (T,), the same for all joints, or (T, n); within ±1.
+            has_jumps: Whether it jumps on purpose.
+        """
+        signal = signal[:, None] if signal.ndim == 1 else signal
+        return Trajectory(
+            name=name,
+            time=self.time,
+            des_dof_pos=(signal + self.bias) * self.scale,
+            joint_names=tuple(self.cfg.joint_order),
+            has_jumps=has_jumps,
+        )
+
+    def _check_time_and_band(self) -> None:
+        if not (np.isfinite(self.control_dt) and self.control_dt > 0):
+            raise ValueError(f"control_dt is {self.control_dt}; expected a time above zero [s].")
+        shortest = _MIN_SAMPLES * self.control_dt
+        if not (np.isfinite(self.duration) and shortest <= self.duration <= 3600):
+            raise ValueError(
+                f"The duration is {self.duration:g} s; expected {shortest:g} s ({_MIN_SAMPLES} samples) to 3600 s. "
+                "20 s is usual."
+            )
+        low, high, nyquist = self.min_frequency, self.max_frequency, 0.5 / self.control_dt
+        if not (0 < low < high < nyquist):
+            raise ValueError(
+                f"The band is {low:g} to {high:g} Hz; expected 0 < min_frequency < max_frequency < {nyquist:g} Hz "
+                "(half the control rate). 0.1 to 10 Hz is usual."
+            )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,9 +146,6 @@ def write_command_csv(path: str | os.PathLike[str], trajectory: Trajectory) -> P
 
     Joints that follow speeds have ``des_dof_vel/<joint>``. Numbers have as many digits as it takes to read back the
     same. The file appears whole or not at all.
-
-    Raises:
-        ValueError: If the path does not end in ``.csv``.
     """
     path = Path(path)
     if path.suffix.lower() != ".csv":

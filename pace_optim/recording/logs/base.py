@@ -106,9 +106,6 @@ def base_fields(log: Log, base: BaseMap, time: np.ndarray) -> dict[str, Any]:
     """The fields of a recording, at its instants (T,) [s].
 
     What an IMU shows is interpolated straight, contacts keep to the nearest value.
-
-    Raises:
-        ValueError: If the log has no such channel.
     """
     result: dict[str, Any] = {}
     for series, channels in base.series.items():
@@ -140,11 +137,7 @@ def _at(log: Log, name: str, time: np.ndarray, straight: bool) -> np.ndarray:
 
 
 def read_base(content: Mapping[str, Any], path: str) -> BaseMap:
-    """The tables ``base``, ``contact`` and ``foot_force`` of a column map.
-
-    Raises:
-        ValueError: If they are no such tables; the message names the key.
-    """
+    """The tables ``base``, ``contact`` and ``foot_force`` of a column map."""
     series: dict[str, Channels] = {}
     for key, entry in content.get("base", {}).items():
         if key not in BASE_COLUMNS:

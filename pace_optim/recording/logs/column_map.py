@@ -72,11 +72,7 @@ _CURE = "Give --columns a column map, as pace import writes it."
 
 
 def read_map(path: Path) -> ColumnMap:
-    """Read a column map.
-
-    Raises:
-        ValueError: If it is no such map; the message names the key.
-    """
+    """Read a column map."""
     try:
         content = tomllib.loads(file_at(path, _CURE).read_text(encoding="utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -156,13 +152,7 @@ def _check_keys(path: Path, where: str, content: Mapping[str, Any], known: tuple
 
 
 def write_map(path: Path, columns: ColumnMap, comments: tuple[str, ...] = ()) -> None:
-    """Write a map that reads back the same.
-
-    Args:
-        path: Where to.
-        columns: The map.
-        comments: Lines for its head.
-    """
+    """Write a map that reads back the same."""
     text = map_text(columns, comments)
     write_atomically(path, lambda file: file.write(text.encode()))
 

@@ -17,10 +17,9 @@ from pace_optim.recording.keys import COMMAND_SERIES, CONDITIONS, JOINT_SERIES, 
 
 from .base import guess_base
 from .column_map import ColumnMap, Source
-from .words import match, only_numbers
 from .log import Channel, Log
-from .units import Known, UnitUnknown, guessed_units
-from .words import CURRENTS, GAINS, NEED_FACTOR, UNITS, meaning
+from .units import Known, UnknownUnitError, guessed_units
+from .words import CURRENTS, GAINS, NEED_FACTOR, UNITS, match, meaning, only_numbers
 
 _PLANNED = re.compile(r":(positions|velocities|effort|(desired|reference|output)\.\w+)\[")
 """Of a trajectory or a controller's state: its speeds and torques are those of the plan, which few drives get."""
@@ -89,7 +88,6 @@ def guess_map(log: Log, robot: Robot) -> Guess:
     """Find which channel is which series of which joint.
 
     Args:
-        log: The log.
         robot: The robot, as far as it is known.
     """
     notes: list[str] = []
@@ -362,7 +360,7 @@ def _with_units(
             try:
                 units, more = guessed_units(series, known, scaled, of_positions)
                 notes += more
-            except UnitUnknown as error:
+            except UnknownUnitError as error:
                 units = error.units
                 unknown.append(str(error))
         for name, each in group.items():

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -52,7 +55,6 @@ def cleaned(
     Rows of one instant whose cells complete each other are one row. Of two values of one instant the last counts.
 
     Args:
-        table: The topic or file.
         time: Instants, (T,) [s].
         columns: Values by key, (T,) each; NaN where a cell is empty.
         what: `series` and `joint` by key, where they are known.
@@ -87,3 +89,14 @@ def cleaned(
     if empty:
         notes.append(f"{where}{empty} empty cells were left out, each in its column alone.")
     return channels, notes
+
+
+def reader(module: str, path: Path) -> Any:
+    """Import a reader of logs."""
+    try:
+        return import_module(module)
+    except ImportError:
+        raise ValueError(
+            f"{path}: reading it needs the package {module.partition('.')[0]}, which is not installed. Install it with "
+            'pip install "pace-mujoco[logs]".'
+        ) from None

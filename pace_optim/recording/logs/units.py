@@ -50,7 +50,7 @@ class Known:
     """All its series, as logged."""
 
 
-class UnitUnknown(ValueError):
+class UnknownUnitError(ValueError):
     """Joints may be in either of two units; the message names them."""
 
     def __init__(self, message: str, units: dict[str, str]) -> None:
@@ -68,10 +68,9 @@ def guessed_units(
         series: `dof_pos`, ...
         known: The joints that have it, by name.
         positions: Positions whose unit was found before, in SI units, by joint.
-        of_positions: Their units.
 
     Raises:
-        UnitUnknown: If a joint may be in either of two units.
+        UnknownUnitError: If a joint may be in either of two units.
     """
     if series in CONDITIONS:
         return dict.fromkeys(known, next(iter(UNITS[series]))), []
@@ -111,7 +110,7 @@ def _of_positions(
     if unknown := [name for name in open_ones if not units[name]]:
         ranges = listed(f"{n} ({channels[n].values.min():.3g} to {channels[n].values.max():.3g})" for n in unknown)
         there = listed(name for name in units if units[name] == small)
-        raise UnitUnknown(
+        raise UnknownUnitError(
             f"the unit of {ranges}: {whole} or {_WORDS[small]}, as {there} {'is' if ',' not in there else 'are'} in",
             {name: unit or small for name, unit in units.items()},
         )

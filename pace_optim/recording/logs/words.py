@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-import numpy as np
 
+import numpy as np
 
 POSITION, VELOCITY, EFFORT = "dof_pos", "dof_vel", "dof_effort"
 TEMPERATURE, VOLTAGE = "temperature", "voltage"
@@ -152,7 +151,6 @@ def meaning(name: str, table: str = "") -> Meaning:
     """What a column's name says.
 
     Args:
-        name: The column's name.
         table: What names the topic or file, in which a command may be named.
     """
     unit, of_unit, without_unit = _unit(name)

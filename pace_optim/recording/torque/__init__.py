@@ -1,7 +1,6 @@
 """What the torque in a recording says of the drive: its gains, feed-forward, limit and delay; and its noise."""
 
-from .channel import NoTorqueError, TorqueChannel, torque_channel
-from .drives import MeasuredDrives, read_drives
+from .drives import MeasuredDrives, NoTorqueError, TorqueChannel, read_drives, torque_channel
 from .law import MeasuredLaw, read_law
 
 __all__ = [

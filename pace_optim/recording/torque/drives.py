@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from pace_actuators.joint_units import JointType
+from pace_actuators.joint_units import JointType, units_for
+from pace_actuators.text import listed
 from pace_optim.recording import Recording
 from pace_optim.recording.commands import acting_loops
+from pace_optim.recording.noise import noise_floor
 
 from .law import APART, SURE, MeasuredLaw, has_offset, read_law
-from .words import contradiction, delay_sentence, line_of_joint
 
 FOLLOWS = 0.9
 """A torque of which the law explains less is not that of this law: a current with much else in it, or another unit."""
@@ -51,7 +52,6 @@ class MeasuredDrives:
         """Within what unknown gains are refined that torques say: lower, start and upper factor, by label and joint.
 
         Args:
-            facts: Unknown facts.
             factors: The parameter that is a factor of each gain.
             sensed: Joints whose torques a fit follows: their gains are as unsure as their sensors' scales.
         """
@@ -89,14 +89,11 @@ def read_drives(
     """Read the law of every joint in every recording that has its torque, and take the facts that are not stated.
 
     Args:
-        recordings: On the control grid.
         configured: Gains and limits where a recording states none, by field, (n,).
         delay_bounds: Between what the delay is sought [control steps].
-        delay_mode: What the drives delay.
         control_dt: Control step [s].
         unknown: Facts that are stated and that are not to be believed.
         assumed: Joints without stated gains: the configured ones are assumed.
-        slides: Joints that slide.
         sensed: Joints whose torques a fit follows: a constant part is one of their sensors, and not of their drives.
     """
     laws: dict[str, dict[str, MeasuredLaw]] = {}
@@ -229,3 +226,246 @@ def _delay(
     used = delay_mode == "command" and low < high and not late
     span = (min(law.delay for law in known), max(law.delay for law in known))
     return (low, high) if used else None, delay_sentence(span, (low, high), used, late, delay_mode, control_dt)
+
+
+_WORDS = {"stiffness": "stiffness", "damping": "damping", "effort_limit": "torque limit"}
+_EXACT = 0.02
+"""How near a ratio is to one of units."""
+_FACTORS = (
+    (180 / np.pi, ("180/pi", "positions or speeds may be in degrees, or the gain per degree")),
+    (2 * np.pi, ("2 pi", "positions or speeds may be in turns, or the gain per turn")),
+    (1000.0, ("1000", "a series may be in thousandths (mrad, mN m, permille)")),
+)
+_UNITS = {"stiffness": "N m/rad", "damping": "N m s/rad", "effort_limit": "N m"}
+
+
+def line_of_joint(
+    laws: Sequence[MeasuredLaw], follows: Callable[[MeasuredLaw], bool], control_dt: float, joint_type: JointType
+) -> str:
+    """One line on a joint, of all its recordings.
+
+    Args:
+        laws: Of the joint, one for each recording.
+        follows: Whether a torque follows a law.
+        control_dt: Control step [s].
+        joint_type: Whether the joint turns or slides.
+    """
+    good = [law for law in laws if follows(law)]
+    joint = laws[0].joint
+    if not good:
+        best = max(law.r_squared for law in laws)
+        return (
+            f"{joint}: dof_effort is not the torque of a PD law of its error (R² {best:.2g}): nothing is read from it."
+        )
+    parts = [
+        f"kp {_values(good, 'stiffness')} N m/rad" if "stiffness" in good[0].std else "",
+        f"kd {_values(good, 'damping')} N m s/rad" if "damping" in good[0].std else "",
+        f"feed-forward {_values(good, 'feed_forward')}" if good[0].feed_forward is not None else "",
+        f"constant {_values(good, 'offset')} N m" if any(has_offset(law) for law in good) else "",
+        f"delay {_range([1e3 * control_dt * law.delay for law in good])} ms",
+        _limit(good),
+    ]
+    r_squared = min(law.r_squared for law in good)
+    residual = max(law.residual for law in good)
+    text = (
+        f"{joint}: its dof_effort says {', '.join(part for part in parts if part)} "
+        f"(R² {r_squared:.4f}, residual {residual:.2g} N m)."
+    )
+    return units_for(text, [joint_type])
+
+
+def contradiction(
+    law: MeasuredLaw,
+    fact: str,
+    stated: float,
+    value: float,
+    std: float,
+    by_recording: bool,
+    holds: bool,
+    joint_type: JointType,
+) -> str:
+    """What is stated, what the torque says, which of the two counts, and whether a unit is the reason."""
+    error = f" ± {std:.1g}" if std else ""
+    where = "stated" if by_recording else "configured"
+    text = f"{_WORDS[fact]} of {law.joint} is {where} as {stated:.4g} {_UNITS[fact]}, and its dof_effort says "
+    text += f"{value:.4g}{error}"
+    if unit := _unit_between(value / stated if stated else 0.0):
+        text += f", {unit}"
+    if holds:
+        text += f": the {where} value is used. Correct {fact}, or fit with --unknown {fact}. [W4]"
+    else:
+        text += ": the torque's value is used. [W4]"
+    return units_for(text, [joint_type])
+
+
+def _unit_between(ratio: float) -> str:
+    """The units that a ratio of a gain by torque to that which is stated may come from; "" for none."""
+    for factor, words in _FACTORS:
+        for own, what in ((factor, f"{words[0]} times that"), (1 / factor, f"{words[0]} times less")):
+            if abs(ratio / own - 1) < _EXACT:
+                return f"{what}: {words[1]}"
+    return ""
+
+
+def delay_sentence(
+    span: tuple[float, float],
+    bounds: tuple[float, float],
+    used: bool,
+    late: bool,
+    delay_mode: str,
+    control_dt: float,
+) -> str:
+    """Where the delay is sought for what the torques say, or why they say nothing of it.
+
+    Args:
+        span: Smallest and largest delay of the joints [control steps].
+        bounds: Where all of them allow it [control steps].
+        used: Whether it is sought there.
+        late: Whether position and command are as late as each other in every torque.
+        control_dt: Control step [s].
+    """
+    low, high = (1e3 * control_dt * each for each in bounds)
+    if used:
+        return f"By dof_effort the delay is sought from {low:.3g} to {high:.3g} ms."
+    if late:
+        return (
+            "In dof_effort the position is as late as the command: the log has its torques late, or the drives delay "
+            "their torque (--delay_mode effort)."
+        )
+    if delay_mode == "command":
+        first, last = (1e3 * control_dt * each for each in span)
+        return (
+            f"By dof_effort the delays are {first:.3g} to {last:.3g} ms. No delay within the bounds fits all of them, "
+            "so it is sought within its bounds."
+        )
+    return ""
+
+
+def _values(laws: Sequence[MeasuredLaw], field: str) -> str:
+    """A value with its error, or from the smallest to the largest of several recordings."""
+    values = [getattr(law, field) for law in laws]
+    text = _range(values)
+    return text if " to " in text else f"{text} ± {max(law.std[field] for law in laws):.1g}"
+
+
+def _range(values: Sequence[float]) -> str:
+    low, high = (f"{0.0 + round(each, 9):.4g}" for each in (min(values), max(values)))
+    return low if low == high else f"{low} to {high}"
+
+
+def _limit(laws: Sequence[MeasuredLaw]) -> str:
+    cut = [law.limit for law in laws if law.limit is not None]
+    if cut:
+        return f"limit {_range(cut)} N m"
+    return f"no limit up to {max(law.peak for law in laws):.3g} N m"
+
+
+_LARGEST_OFFSET = 0.5
+"""Part of the largest torque that a sensor's offset is at most."""
+
+
+class NoTorqueError(ValueError):
+    """No recording has a torque that a fit can follow."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TorqueChannel:
+    """Joints whose measured torques a fit follows, τ_m(t) = s τ(t - l) + o + noise, and what it begins with.
+
+    The scale s and the offset o are sought. The lag l is that of the law: beside one that is free, a damping would be
+    viscous friction (a lag of kp (q* - q) is kp l q̇).
+    """
+
+    noise: Mapping[str, float] = field(default_factory=dict)
+    """Standard deviation of what the best law of the drive leaves of a torque, by joint [N m]."""
+    floor: Mapping[str, float] = field(default_factory=dict)
+    """That of its noise, by joint [N m]."""
+    lag: Mapping[str, float] = field(default_factory=dict)
+    """l, by joint [control steps]; below 0: the log has a torque before its position."""
+    offsets: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    """Lower bound, start and upper bound of o, by joint [N m]."""
+    notes: tuple[str, ...] = ()
+    """Which joints they are, and which are left out, in sentences."""
+
+
+def torque_channel(recordings: Sequence[Recording], measured: MeasuredDrives, why_not: str = "") -> TorqueChannel:
+    """The channel of joints whose torques are those of their drives.
+
+    What a filter or coarse steps make of a torque is noise to a fit: it begins with what the best law of the drive
+    leaves, and goes on with what it leaves itself.
+
+    Args:
+        why_not: Why none can be followed; empty: they can.
+
+    Raises:
+        NoTorqueError: If no torque can be followed.
+    """
+    if not any(recording.dof_effort is not None for recording in recordings):
+        raise NoTorqueError("--residual effort needs measured torques (dof_effort), and no recording has any.")
+    noise: dict[str, float] = {}
+    known: dict[str, list[MeasuredLaw]] = {}
+    out: dict[str, list[str]] = {}
+    for joint in recordings[0].joint_names:
+        laws = list(measured.laws.get(joint, {}).values())
+        reason = why_not or _why_not(joint, laws, measured)
+        if reason:
+            out.setdefault(reason, []).append(joint)
+        else:
+            noise[joint], known[joint] = max(law.residual for law in laws), laws
+    if not noise:
+        raise NoTorqueError(
+            f"--residual effort: no torque can be followed: {'; '.join(out)}. Fit with --residual position."
+        )
+    notes = [f"dof_effort of {listed(joints, 6)} is left out of the residuals: {why}." for why, joints in out.items()]
+    notes.insert(
+        0,
+        f"The fit follows dof_effort of {listed(list(noise), 6)} beside the positions. What is read from it is a start "
+        "value.",
+    )
+    return TorqueChannel(
+        noise=noise,
+        floor={joint: _floor(recordings, joint, measured.laws[joint]) for joint in noise},
+        lag={joint: float(np.median([law.feedback_lag for law in laws])) for joint, laws in known.items()},
+        offsets={joint: _offsets(laws) for joint, laws in known.items()},
+        notes=tuple(notes),
+    )
+
+
+def _offsets(laws: Sequence[MeasuredLaw]) -> tuple[float, float, float]:
+    """Where the offset of a joint's sensor is sought [N m]."""
+    most = _LARGEST_OFFSET * max(law.peak for law in laws)
+    return -most, float(np.clip(np.median([law.offset for law in laws]), -most, most)), most
+
+
+def _why_not(joint: str, laws: Sequence[MeasuredLaw], measured: MeasuredDrives) -> str:
+    """Why the torque of a joint is not followed; empty: it is."""
+    if not laws:
+        return "it does not change, or is not there"
+    if all(_repeats_the_command(law) for law in laws):
+        return "it repeats the torque that is commanded"
+    if joint in measured.contested_joints:
+        return "it contradicts what is stated of the drive"
+    if not all(follows(law) for law in laws):
+        return "it is not the torque of a PD law"
+    return ""
+
+
+def _repeats_the_command(law: MeasuredLaw) -> bool:
+    """Whether a torque shows nothing of a position or a speed."""
+    fed_back = [(getattr(law, gain), law.std[gain]) for gain in ("stiffness", "damping") if gain in law.std]
+    return law.feed_forward is not None and not any(abs(value) > SURE * std for value, std in fed_back)
+
+
+def _floor(recordings: Sequence[Recording], joint: str, laws: Mapping[str, MeasuredLaw]) -> float:
+    """Standard deviation of the noise of a joint's torque, over recordings that have it [N m].
+
+    It is that of the spectrum above the motion, as an encoder's. A torque that is held has steps in its spectrum: what
+    a law leaves of it is noise at most.
+    """
+    squares = []
+    for recording in recordings:
+        if recording.name in laws and recording.dof_effort is not None:
+            torque = recording.dof_effort[:, recording.joint_names.index(joint)]
+            of_spectrum = noise_floor(torque[np.isfinite(torque)], float(np.median(np.diff(recording.time)))).sigma
+            squares.append(min(of_spectrum, laws[recording.name].residual) ** 2)
+    return float(np.sqrt(np.mean(squares)))

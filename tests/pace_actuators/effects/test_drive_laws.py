@@ -24,7 +24,7 @@ from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.estimate.comb_scan import scanned
 from pace_optim.joints.fits.base_fit import fit_base
 from pace_optim.joints.fits.model import JointModel
-from pace_optim.problem.drive_work import drive_reach, with_work
+from pace_optim.problem.log_and_robot import drive_reach, with_work
 from pace_optim.recording.dataset import Work
 from pace_optim.run.result import FitResult
 

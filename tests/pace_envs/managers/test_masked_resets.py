@@ -57,7 +57,7 @@ def test_terms_of_one_s_own_are_told_the_environments_unless_they_say_that_they_
 
 def test_a_curriculum_judges_episodes_alike_whether_they_are_counted_or_not():
     env = ManagerBasedRLEnv(without_chance())
-    term = env.curriculum_manager._terms[0]
+    term = env.curriculum_manager.terms[0]
     other = ManagerBasedRLEnv(without_chance())
     for step in range(12):
         ids = torch.arange(step % 4, NUM_ENVS, 3)

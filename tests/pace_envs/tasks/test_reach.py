@@ -6,8 +6,7 @@ import torch
 from pace_envs import ManagerBasedRLEnv, load_env_cfg
 from pace_envs.rl import RunSettings, load_cfg, train
 from pace_envs.rl.playing import PlaySettings, play
-from pace_envs.tasks.reach.reach_env_cfg import COMMAND
-from pace_envs.tasks.reach.terms import closeness, distance, site_position, to_command
+from pace_envs.tasks.reach.reach_env_cfg import COMMAND, closeness, distance, site_position, to_command
 
 TASK = "Pace-SO101-Reach-v0"
 WHERE = {"command_name": COMMAND, "site": "gripper_frame"}
@@ -61,7 +60,7 @@ def test_options_of_walking_are_refused():
 
 
 @pytest.mark.slow
-def test_it_is_trained_played_and_judged(tmp_path):
+def test_it_is_trained_played_and_judged(tmp_path, no_export):
     run = train(RunSettings(task=TASK, num_envs=16, max_iterations=1, log_dir=str(tmp_path)))
     result = play(PlaySettings(checkpoint=str(run), num_envs=4, seconds=4.0))
     assert 0 < result.distance < 1 and "within 20 mm" in str(result)

@@ -14,7 +14,7 @@ from pace_envs.robot_spec import find_geoms, load_robot_spec
 from pace_envs.robots import go2_cfg
 from pace_envs.task_source import model_files
 from pace_envs.tasks.reach import reach_env_cfg
-from pace_envs.tasks.reach.terms import site_position
+from pace_envs.tasks.reach.reach_env_cfg import site_position
 from pace_envs.tasks.velocity import add_randomization, energy_rewards, velocity_env_cfg, velocity_rewards
 
 LEGS = tuple(itertools.product((0.2, -0.2), (0.1, -0.1)))

@@ -6,11 +6,20 @@ import numpy as np
 import pytest
 from problems import BENCH, env_cfg, make_problem, record
 
+from pace_optim.comparison.dimensions import motion_of
 from pace_optim.comparison.drive_loads import load_torques
 from pace_optim.comparison.error_regions import worst_places
-from pace_optim.comparison.frequency import band_edges, band_power, narrowest_band, response
-from pace_optim.comparison.joint import compare_joint, hysteresis, rmse_by_part, share_above, whiteness
-from pace_optim.comparison.motion import motion_of
+from pace_optim.comparison.joint import (
+    band_edges,
+    band_power,
+    compare_joint,
+    hysteresis,
+    narrowest_band,
+    response,
+    rmse_by_part,
+    share_above,
+    whiteness,
+)
 from pace_optim.comparison.regions import best_region, evidence, lay_out
 from pace_optim.comparison.tracks import Track
 from pace_optim.recording import Load

@@ -7,8 +7,7 @@ from bench_recordings import Bench, chirp, record
 
 from pace_actuators import ActuatorActions, PaceDCMotor, PaceDCMotorCfg
 from pace_optim.commands.compare import main as compare
-from pace_optim.comparison.dimensions import dimensions_of
-from pace_optim.comparison.motion import motion_of
+from pace_optim.comparison.dimensions import dimensions_of, motion_of
 from pace_optim.comparison.regions import Region
 from pace_optim.comparison.words import place_text
 from pace_optim.diagnosis import candidate_effects

@@ -25,7 +25,7 @@ from pace_envs import set_physics_dt
 from pace_optim.estimate.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
 from pace_optim.problem.rollout import Rollout
 from pace_optim.recording import Drive, Load
-from pace_optim.recording.resample import interpolate_smooth
+from pace_optim.recording.time_base import interpolate_smooth
 from pace_optim.recording.windows import Windows
 
 EXACT = 1e-12  # [rad²]

@@ -12,9 +12,8 @@ from pace_envs import ManagerBasedRLEnv, load_env_cfg
 from pace_envs.compiler import host
 from pace_optim.estimate.derivatives import colour, stencil
 from pace_optim.estimate.error_bars.assessment import _LATE, _late_forces
-from pace_optim.problem.base_path import base_path
 from pace_optim.problem.free_phases import FreePhases, encoder_noise
-from pace_optim.problem.moving_base import imu_pose, joints_of_feet, on_moving_base
+from pace_optim.problem.moving_base import base_path, imu_pose, joints_of_feet, on_moving_base
 from pace_optim.problem.problem import load_problem
 from pace_optim.recording.data import ImuPose
 from pace_optim.recording.dataset import make_dataset

@@ -20,7 +20,7 @@ from pace_optim.recording import (
     save_recording,
     validation_start,
 )
-from pace_optim.recording.resample import hold_on_grid, interpolate_smooth
+from pace_optim.recording.time_base import hold_on_grid, interpolate_smooth
 
 
 def full_recording() -> Recording:

@@ -8,8 +8,7 @@ from places import SHARED
 from problems import DT, record
 
 from pace_optim.recording import conform_recording, load_recording
-from pace_optim.recording.dataset import make_dataset
-from pace_optim.recording.start import start_speed
+from pace_optim.recording.dataset import make_dataset, start_speed
 
 IN_MOTION = SHARED / "cases" / "strangers" / "in_motion2"
 

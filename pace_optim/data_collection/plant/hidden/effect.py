@@ -133,11 +133,7 @@ def hidden(effect: type[HiddenEffect]) -> type[HiddenEffect]:
 
 
 def effect_named(name: str) -> type[HiddenEffect]:
-    """The effect of a name.
-
-    Raises:
-        ValueError: If it does not exist.
-    """
+    """The effect of a name."""
     if name not in EFFECTS:
         close = difflib.get_close_matches(name, EFFECTS, n=1, cutoff=0.4)
         hint = f" Did you mean {close[0]!r}?" if close else ""

@@ -16,7 +16,7 @@ from pace_optim.identification.log_checks import check_log, checked
 from pace_optim.identification.log_checks.balance import View
 from pace_optim.identification.log_checks.checks import _flat_ends, swapped
 from pace_optim.identification.setup import load_for_fit
-from pace_optim.problem.bounded_least_squares import bounded_least_squares
+from pace_optim.problem.inverse_dynamics import bounded_least_squares
 from pace_optim.problem.problem import load_problem
 from pace_optim.recording import Drive
 from pace_optim.run.settings import FitSettings

@@ -1,7 +1,6 @@
 """Logs of other programs: the same motion written in many ways is read as the same recording."""
 # ruff: noqa: E501
 
-from places import SHARED
 import csv
 import json
 import re
@@ -10,12 +9,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from places import SHARED
 from recordings import says
 
 from pace_optim.commands import import_log
 from pace_optim.recording import load_recording, save_recording
 from pace_optim.recording.logs import Robot, load_recordings, paired_files, read_map, tables, understood, write_map
-from pace_optim.recording.logs.messages import rows_of
+from pace_optim.recording.logs.rosbag import rows_of
 from pace_optim.recording.logs.words import meaning
 from pace_optim.terminal.cli import run_cli
 
@@ -283,7 +283,17 @@ def test_csv_of_any_names_units_and_stamps(tmp_path, header, stamp, scale, absol
 
 
 def test_temperatures_of_motors_and_the_voltage_of_a_battery_are_read(tmp_path):
-    names = ["time", "hip pos", "knee pos", "hip cmd", "knee cmd", "hip temp [°C]", "knee temperature", "imu temp", "battery_voltage"]
+    names = [
+        "time",
+        "hip pos",
+        "knee pos",
+        "hip cmd",
+        "knee cmd",
+        "hip temp [°C]",
+        "knee temperature",
+        "imu temp",
+        "battery_voltage",
+    ]
     columns = [STAMPS / 1e9, *POS.T, *HELD.T, *(40.0 + POS).T, 0.0 * STAMPS, 24.0 - POS[:, 0]]
     rows(names, columns, tmp_path / "log.csv")
     (recording,) = load_recordings(tmp_path / "log.csv", ROBOT)

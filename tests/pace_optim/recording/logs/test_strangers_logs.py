@@ -1,19 +1,19 @@
 """Logs of strangers: names, units by joint, clocks, switches and gains are read right, or refused with the reason."""
 
-from places import SHARED
 import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from places import SHARED
 
 from pace_optim.recording import Recording, load_recording
+from pace_optim.recording.data import notes_by_kind
+from pace_optim.recording.dataset import start_speed
 from pace_optim.recording.gaps import split_at_gaps
 from pace_optim.recording.logs import ColumnMap, Robot, load_recordings, read_map, understood, with_rate
-from pace_optim.recording.data import notes_by_kind
-from pace_optim.recording.stamps import set_back, unrounded
-from pace_optim.recording.start import start_speed
+from pace_optim.recording.time_base import set_back, unrounded
 
 TIME = np.arange(800) / 200
 MOTION = 0.8 * np.sin(3 * TIME) + 1e-4 * np.random.default_rng(0).normal(size=len(TIME))

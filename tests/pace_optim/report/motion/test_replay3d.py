@@ -11,7 +11,7 @@ from pace_envs.model_file import read_model_file
 from pace_optim.commands.replay import main
 from pace_optim.report import write_report
 from pace_optim.report.motion import looks_of, motions_of, scene_of
-from pace_optim.report.motion.window import add_ghost
+from pace_optim.report.motion.motion import add_ghost
 from pace_optim.report.run_data import RecordingData
 
 from run_folders import JOINTS, make_trajectory, write_run  # isort: skip

@@ -1,4 +1,4 @@
-"""Write the page that lists the effects: ``python -m pace_actuators.effects > docs/effects.md``."""
+"""Write the page that lists the effects: ``python docs/site/effect_list.py > docs/effects.md``."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ Bounds of torques follow the drive. Curves are straight from knot to knot, at `c
 beyond the last knot. They show what is missing, not why. `pace diagnose` compares them with the effects that it found,
 and takes a curve if no effect explains the error.
 
-`python -m pace_actuators.effects > docs/effects.md` makes this page. [Your own effect](your_own_effect.md) adds one.
+`python docs/site/effect_list.py > docs/effects.md` makes this page. [Your own effect](your_own_effect.md) adds one.
 
 ## Equations
 

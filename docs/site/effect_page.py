@@ -10,7 +10,6 @@ def effect_page(effect: type[Effect], picture: str | None = None) -> str:
     """A page in Markdown: what it is, what a person sees, its parameters, its likes, how to add it.
 
     Args:
-        effect: The effect.
         picture: Path of a picture of the error that it leaves, from the page.
     """
     parts = [f"# {effect.name}\n\n{_sentence(effect.looks)}\n"]
