@@ -121,8 +121,8 @@ class LinksCfg:
     """Of each fit, at most."""
     most: int = 3
     """Wrong links, at most."""
-    tolerance: float = 1e-2
-    """They end where less than this part of the score is left to gain, or was gained in each of the last three."""
+    tolerance: float = 1e-3
+    """They end where less than this part of the score is left to gain."""
     cost: float = 0.25
     """Power of the number of parameters by which what they explain is divided."""
 

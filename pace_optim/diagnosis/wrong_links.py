@@ -399,10 +399,7 @@ def _look_alikes(base: _Fitted, joints_of: Mapping[str, Sequence[str]], cfg: Lin
 def _fit(problem: Problem, values: Mapping[str, Mapping[str, float]], cfg: LinksCfg, *, whole: bool = False) -> _Fitted:
     """The problem fitted from near, on pieces, or on all that is trained on."""
     near = LeastSquaresCfg(
-        max_iteration=cfg.iterations,
-        score_tolerance=cfg.tolerance,
-        creep_tolerance=cfg.tolerance,
-        noise_score=noise_score(problem),
+        max_iteration=cfg.iterations, score_tolerance=cfg.tolerance, noise_score=noise_score(problem)
     )
     stage = problem if whole else problem.on_pieces(cfg.share)
     start = _values_in(problem, values)

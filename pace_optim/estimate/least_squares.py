@@ -53,9 +53,8 @@ class LeastSquaresCfg:
     """Stop when the score fell by less than this part of it in each of the last three iterations, on average."""
 
     near_enough: float = 2e-3
-    """A descent ends when an iteration lowers the score by less than this part of it, or than what may be left to gain:
-    the look for the error bars takes the rest. By derivatives of a longer physics step, a rough simulation goes on with
-    those of the fit's own step, until little is left or it creeps."""
+    """A descent by derivatives of a longer physics step ends when an iteration lowers the score by less than this part
+    of it: the look for the error bars takes the rest. A rough simulation goes on with derivatives at the fit's step."""
 
     target_score: float = 1e-16
     """Stop below this score [rad²]."""
@@ -228,9 +227,9 @@ def _iterate(
         if step.expected <= allowed:
             break
     gained = descent.scores[-2] - descent.scores[-1]
-    enough = max(cfg.near_enough, cfg.tolerance(descent.score)) * descent.score
-    beside = jacobian is not None and not descent.own_step and gained <= enough
-    if beside and evaluator.looks_coarser and descent.noise >= ROUGH * descent.score**0.5 and descent.iteration < cfg.max_iteration:
+    longer = jacobian is not None and evaluator.looks_coarser and not descent.own_step
+    beside = longer and gained <= cfg.near_enough * descent.score
+    if beside and descent.noise >= ROUGH * descent.score**0.5 and descent.iteration < cfg.max_iteration:
         descent.own_step, descent.damping = True, FIRST_DAMPING
         descent.gradient, descent.refused = None, 0
         return
