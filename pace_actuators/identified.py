@@ -285,8 +285,8 @@ def step_notes(cfg: PaceDCMotorCfg, physics_dt: float | None) -> list[str]:
     if ratio > _FARTHEST * (1 + 1e-6):
         notes.append(
             f"The drive was identified with physics steps of {1e3 * at.physics_dt:g} ms, which are "
-            f"{1e3 * physics_dt:g} ms here. Its values include the error of that step. Identify again with steps "
-            "nearer to these, or replay the recording here to see the difference (pace play --replay)."
+            f"{1e3 * physics_dt:g} ms here. Its values may include the error of that step. Replay the recording "
+            "to see the difference (pace play --replay). If it is large, identify again with steps nearer to these."
         )
     return notes
 
