@@ -115,7 +115,7 @@ class LinksCfg:
     """Normalised step of the derivatives."""
     tried: int = 4
     """Candidates of a round that are fitted, ..."""
-    of_link: int = 3
+    of_link: int = 2
     """and so many of them of one link."""
     iterations: int = 15
     """Of each fit, at most."""
