@@ -34,7 +34,7 @@ class LinkStates:
     passive: np.ndarray
     """Springs, viscous and Coulomb friction of the model, (B, nv)."""
     follow: np.ndarray
-    """Speeds by those of the driven joints, (B, nv, n) or (nv, n)."""
+    """Speeds by those of the driven joints, (B, nv, n)."""
     frame: np.ndarray
     """How the model's frame moves, (B, 9): see :mod:`pace_envs.moving_frame`."""
     point: np.ndarray
@@ -110,9 +110,12 @@ class LinkStates:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What changes of links change of what the joints feel that carry them, (B, n) each.
 
-        A body moves as x' = V x + v, its joint moves it as x' = S x + s; in (4, 4) and with J its pseudo-inertia in
-        the world's axes, M_jj = tr(S' S J) and τ_j = tr(S' A J) where A = V̇ + V V has its acceleration less gravity
-        (Wensing, Kim, Slotine, IEEE Robot. Autom. Lett. 3, 2018, have this J).
+        V is the velocity field of a body and S that of its joint at unit speed, as (4, 4) matrices on points (x, 1).
+        With the body's pseudo-inertia J in the world's axes (Wensing, Kim, Slotine, IEEE Robot. Autom. Lett. 3, 2018),
+
+            M_jj = tr(S' S J),    τ_j = tr(S' A J),    A = V̇ + V V
+
+        where V̇ has the acceleration less gravity.
 
         Args:
             of: The changes.
