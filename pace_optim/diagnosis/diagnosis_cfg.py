@@ -81,7 +81,6 @@ class VerdictCfg:
 RULES = (
     "look_ahead",
     "replace",
-    "echo",
     "pool",
     "trim",
     "wide_steps",

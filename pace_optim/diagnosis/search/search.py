@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import torch
-
 from pace_optim.diagnosis.search.grow import grown
 from pace_optim.diagnosis.search.look_ahead import further_with_next_best
 from pace_optim.diagnosis.search.state import Branch, Outcome, Search
 from pace_optim.diagnosis.selection.candidate_results import Round
-from pace_optim.diagnosis.selection.rules import decide
-from pace_optim.joints.fits.block_errors import BlockErrors
 from pace_optim.joints.fits.fitted import Fitted
 from pace_optim.joints.simulation.problem import TwinProblem
 
@@ -28,7 +24,6 @@ def add_effects(search: Search, problem: TwinProblem, base: Fitted) -> Outcome:
     found = search.tried(branch)
     while found is not None and any(effect is not None for effect in found.chosen):
         branch, found = added(search, branch, found)
-    branch = without_echoes(search, branch, errors)
     return Outcome(
         problem=branch.problem,
         base=base,
@@ -48,32 +43,3 @@ def added(search: Search, branch: Branch, found: Round) -> tuple[Branch, Round |
     if branch.rounds or ahead is None or not search.cfg.has("look_ahead"):
         return end, ahead
     return further_with_next_best(search, branch, found, end, ahead) or (end, ahead)
-
-
-def without_echoes(search: Search, branch: Branch, base: BlockErrors) -> Branch:
-    """The branch with an effect on one alone of joints that move each other, where that is as good along its motion.
-
-    What one joint lacks moves the others too, which then seem to lack the same.
-
-    Args:
-        search: What is looked for.
-        branch: Where the search ended.
-        base: Errors of the base model.
-    """
-    for effect in (each for each in branch.now.model.effects if each not in search.own):
-        has = branch.now.model.has[branch.now.model.effects.index(effect)]
-        echoes = torch.zeros_like(has)
-        for tree in map(list, search.trees):
-            own = [j for j in tree if bool(has[j])]
-            echoes[[j for j in own if j != max(own, key=lambda j: float(base.mse[j]))]] = True
-        if effect.shared or not bool(echoes.any()) or not search.cfg.has("echo"):
-            continue
-        now = branch.now
-        start = Fitted.start(now.model.without_effect(effect, echoes), now.physical, tried=effect)
-        start = search.fits.side_by_side(branch.problem.in_windows(), [start], search.fits.cfg.again)[0]
-        without = search.along_own_motion(branch, start)
-        joints = [j for tree in search.trees for j in tree if bool(echoes[list(tree)].any())]
-        after = {effect.name: without.errors}
-        if len(decide("echo", joints, branch.errors, after, cfg=search.cfg, log=search.log)) == len(joints):
-            branch = without
-    return branch

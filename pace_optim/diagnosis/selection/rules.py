@@ -80,13 +80,6 @@ def _pool(decision: Decision, cfg: DiagnosisCfg) -> Taken:
     return [name if taken else None for _ in decision.joints]
 
 
-def _echo(decision: Decision, cfg: DiagnosisCfg) -> Taken:
-    """An effect that a joint can do without, as another joint of its tree has it."""
-    ((name, after),) = decision.after.items()
-    errors = zip(after.mse.tolist(), decision.before.mse.tolist(), strict=True)
-    return [name if within(without, having, cfg.judging.alike) else None for without, having in errors]
-
-
 def _trim(decision: Decision, cfg: DiagnosisCfg) -> Taken:
     """The fit without some windows, where it is better."""
     ((name, after),) = decision.after.items()
@@ -133,7 +126,6 @@ _RULES: Mapping[str, Callable[[Decision, DiagnosisCfg], Taken]] = {
     "add": _add,
     "replace": _replace,
     "look_ahead": _look_ahead,
-    "echo": _echo,
     "pool": _pool,
     "trim": _trim,
     "name": _name,
