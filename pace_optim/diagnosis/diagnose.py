@@ -11,7 +11,7 @@ from pathlib import Path
 from pace_actuators.effects import EffectCfg
 from pace_actuators.files import json_text, write_together
 from pace_optim.diagnosis.candidates.library import candidate_effects
-from pace_optim.diagnosis.findings.findings import Findings, told, with_refit
+from pace_optim.diagnosis.findings.findings import Findings, as_refitted, told, with_refit
 from pace_optim.diagnosis.findings.result import FILE, Diagnosis
 from pace_optim.diagnosis.method import search_effects
 from pace_optim.diagnosis.selection.decisions import FILE as DECISIONS
@@ -86,15 +86,29 @@ def diagnose(
     _save(diagnosis, decisions)
     progress.close()
     on_verdict(diagnosis)
-    explains = found.verdict == "effect" or bool(found.free_form or wrong.wrong)
-    if not (explains if settings.refit is None else settings.refit) or not (found.paying or wrong.wrong):
-        return diagnosis
-    if (path := _refit(found, wrong, problem, run, diagnosis, progress)) is None:
-        return diagnosis
-    diagnosis = with_refit(diagnosis, found, wrong, problem, result, FitResult.load(path), path)
-    diagnosis = replace(diagnosis, wall_time_s=time.monotonic() - begin)
-    _save(diagnosis, decisions)
+    explains = found.verdict == "effect" or bool(found.free_form)
+    refit = explains if settings.refit is None else settings.refit
+    refit = refit or (bool(wrong.wrong) and settings.refit is None)
+    for tried in (None if settings.refit is False else found.on_trial, found if refit else None):
+        if tried is None or not (tried.paying or wrong.wrong):
+            continue
+        if (path := _refit(tried, wrong, problem, run, diagnosis, progress)) is None:
+            break
+        fitted = FitResult.load(path)
+        if not _stands(tried, found, result, fitted):
+            continue
+        if tried is not found:
+            diagnosis = told(tried, fits, wrong, problem, result, run.settings, folder, candidates)
+        diagnosis = with_refit(diagnosis, tried, wrong, problem, result, fitted, path)
+        diagnosis = replace(diagnosis, wall_time_s=time.monotonic() - begin)
+        _save(diagnosis, decisions)
+        break
     return diagnosis
+
+
+def _stands(tried: Findings, found: Findings, run: FitResult, refit: FitResult) -> bool:
+    """Whether a fit of the whole robot is the diagnosis' own: of hints on trial, if one has become a name."""
+    return tried is found or bool(as_refitted(tried, run, refit).named.keys() - found.named.keys())
 
 
 def _as_found(problem: Problem, result: FitResult) -> Problem:

@@ -124,4 +124,8 @@ def search_effects(
             curves=curves,
         )
 
-    return findings(take_curves(outcome, curves), names.named, curves)
+    found = findings(take_curves(outcome, curves), names.named, curves)
+    if not names.hints or problem.joints_stand_alone:
+        return found
+    hinted = torch.tensor([any(hint.joint == j for hint in names.hints) for j in range(n)])
+    return replace(found, on_trial=replace(findings(outcome, names.named | hinted), hints=()))

@@ -60,6 +60,9 @@ class Findings:
     """Effects that lower the error of joints and have not earned their names."""
     curves: Curves | None = None
     """Which variable carries what is missing; ``None`` where the effects found leave little."""
+    on_trial: Findings | None = None
+    """The same with the hinted effects as if they were named: the fit of the whole robot may show that they are. Joints
+    that move each other, each simulated alone beside others that are still wrong, may not."""
 
     @property
     def paying(self) -> list[str]:

@@ -1,5 +1,6 @@
 """The rule that names effects on joints alone judges the whole robot's fit too."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -9,6 +10,7 @@ from diagnoses import errors_of, joint_alone, make_diagnosis, make_evidence, wit
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis import Diagnosis
 from pace_optim.diagnosis.checks.data_check import DataCheck
+from pace_optim.diagnosis.diagnose import _stands
 from pace_optim.diagnosis.findings.findings import Findings, as_refitted, with_refit
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.wrong_links import LinkFindings
@@ -141,3 +143,16 @@ def test_a_stiff_effect_above_the_floor_has_no_error_bar_in_the_whole_robot_eith
     refit = fit_of(1.5e-4, 0.01, 1e-5, effect=f"backlash.{gap}")
     (size,) = told_again(found, refit, [size_of("backlash", gap)], tmp_path).sizes
     assert size["value"] == 0.01 and size["std"] is None
+
+
+@pytest.mark.parametrize(("left", "stands"), [(1.1e-4, True), (9e-3, False)])
+def test_a_hint_becomes_a_name_where_the_whole_robot_s_fit_leads_near_the_floor(left, stands):
+    """Of joints that move each other one was a hint, `but its size differs`; the whole robot ended at its noise."""
+    on_trial = found_on_joints((QUADRATIC, [0.2]))
+    on_trial = replace(on_trial, named={(QUADRATIC, 0): replace(ALONE, left=9e-5, uneven=5.0)})
+    found = replace(on_trial, named={}, verdict="unknown", on_trial=on_trial)
+    run, refit = fit_of(1e-2), fit_of(left, 0.2, 0.01)
+    assert _stands(on_trial, found, run, refit) is stands and _stands(found, found, run, refit)
+    again = as_refitted(on_trial, run, refit)
+    assert again.added == (["quadratic_friction"] if stands else [])
+    assert again.verdict == ("effect" if stands else "unknown")
