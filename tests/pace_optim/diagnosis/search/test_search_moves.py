@@ -139,22 +139,6 @@ def test_an_effect_on_a_link_is_judged_by_all_joints_that_carry_it(own, without,
     assert found(above, own, trees=[[0], [1]])[0] == [set(), {"payload"}]
 
 
-def test_what_one_joint_lacks_is_not_named_on_another_that_it_moves():
-    """An arm's elastic shoulder gave its elbow an elasticity, and one value for both was neither's."""
-
-    def shoulder(everyone):
-        return constant(4.0) | mrad({(ELASTICITY,): 0.3 if everyone and ELASTICITY in everyone[1] else 0.1})
-
-    def elbow(everyone):
-        first, second = (ELASTICITY in own for own in everyone or [[], []])
-        return constant(2.0 if not first else 0.8 if second else 0.1) | mrad({(ELASTICITY,): 0.25})
-
-    both = constant(2.0) | mrad({(ELASTICITY,): 0.1})
-    assert found(shoulder, elbow, trees=[[0, 1]])[0] == [{"joint_elasticity"}, set()]
-    assert found(shoulder, elbow, trees=[[0], [1]])[0] == [{"joint_elasticity"}] * 2
-    assert found(both, both, trees=[[0, 1]])[0] == [{"joint_elasticity"}] * 2
-
-
 @pytest.mark.parametrize(("pays", "rivals"), [(True, [PAYLOAD]), (False, [])])
 def test_an_effect_on_a_link_that_pays_there_too_stays_a_like_of_one_that_is_not(pays, rivals):
     """A tool at a forearm's tip is not its link's mass scaled: a wrong torque constant seemed to do better."""
