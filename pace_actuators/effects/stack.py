@@ -10,6 +10,7 @@ import torch
 from pace_actuators.effects.drive_state import DriveState
 from pace_actuators.effects.effect import Effect
 from pace_actuators.effects.effect_cfg import EffectCfg
+from pace_actuators.effects.registry import available_effects
 from pace_actuators.effects.two_mass import join_couplings
 from pace_actuators.joint_values import resolve_joint_values
 from pace_actuators.part import Part
@@ -84,15 +85,13 @@ class EffectStack(Part):
         self._arrange()
 
     def _arrange(self) -> None:
-        """Note what each effect sees of the state, and what they do together."""
+        """Note what each effect sees of the state, in which order they act, and what they do together."""
+        known = {name: place for place, name in enumerate(available_effects())}
+        in_order = sorted(self.effects, key=lambda effect: (_side(effect), known.get(effect.name, len(known))))
         self.views = {each: self.state.of_rows(each.rows, each.reads_load, each.reads_link) for each in self.effects}
         """What each effect sees of the state."""
         self._at = {
-            stage: [
-                (getattr(effect, stage), self.views[effect])
-                for effect in sorted(self.effects, key=_side if stage == "transmission" else lambda _: 0)
-                if effect.overrides(stage)
-            ]
+            stage: [(getattr(effect, stage), self.views[effect]) for effect in in_order if effect.overrides(stage)]
             for stage in _STAGES
         }
         for effect in self.effects:

@@ -43,6 +43,24 @@ def test_a_supply_sags_with_the_torque_and_gives_no_more_than_a_quarter_of_its_s
     assert drive.one(5.0) == pytest.approx(50.0)
 
 
+@pytest.mark.parametrize(
+    "pair",
+    [("torque_gain", "torque_ripple"), ("command_rate_limit", "command_filter"), ("torque_gain", "torque_over_torque")],
+)
+def test_effects_act_in_one_order_however_they_are_named(pair):
+    values = {
+        "torque_gain.gain": 0.5,
+        "torque_ripple.cosine": 3.0,
+        "command_rate_limit.velocity": 2.0,
+        "command_filter.time_constant": 0.02,
+        **{f"torque_over_torque.{p.name}": 1.0 for p in get_effect("torque_over_torque").parameters},
+    }
+    own = {name: value for name, value in values.items() if name.partition(".")[0] in pair}
+    first, second = (Drive(list(names), own) for names in (pair, pair[::-1]))
+    for target in (0.0, 0.1, 0.3):
+        assert first.one(target) == second.one(target)
+
+
 def test_a_filter_of_commands_follows_them_exactly():
     drive = Drive(["command_filter"], {"command_filter.time_constant": 0.02})
     assert drive.one(0.0) == 0.0
