@@ -35,7 +35,8 @@ BASE_PARAMETERS: dict[str, BaseParameter] = {
         BaseParameter(name="delay", unit="control steps", shared=True),
     )
 }
-"""All of them by name, in the order of every vector. ``Articulation.write_base_parameter_to_sim`` writes them."""
+"""All of them by name. Vectors and PACE's tensors have this order: append, never insert. One without ``mujoco`` needs a
+branch in ``Articulation.write_base_parameter_to_sim``."""
 
 PER_JOINT = tuple(name for name, parameter in BASE_PARAMETERS.items() if not parameter.shared)
 """Those that every joint has."""

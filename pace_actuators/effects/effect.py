@@ -262,7 +262,7 @@ class Effect(Part):
             buffer.reset(rows)
 
     def remember(self, heat: Heat) -> None:
-        """When a recording begins: take over what the drive did in its session before."""
+        """When a recording begins: take over what the drive did in its session before. Training begins without."""
 
     def notice(self, conditions: Conditions) -> None:
         """When a recording begins: take over what was logged of the drive's conditions."""

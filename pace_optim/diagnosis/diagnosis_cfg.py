@@ -65,7 +65,7 @@ class JudgingCfg:
 
 @dataclass(frozen=True, kw_only=True)
 class VerdictCfg:
-    """Whether a name is earned (``judging.naming``), and what a curve must show."""
+    """Whether a name is earned (``selection/naming.py``), and what a curve must show."""
 
     most: float = 0.75
     """Wrong links together, and a curve, must explain this part of the squared error above the floor without them, so
