@@ -98,6 +98,9 @@ class FitSettings:
     columns: str | None = None
     """Column map of logs that are not in this project's own form; ``None``: guessed."""
 
+    facts: str | None = None
+    """JSON file of gains, limits and loads of all recordings that do not state them; ``None``: no such file."""
+
     rate: float | None = None
     """Rows per second of logs that have no column of time [Hz]."""
 
