@@ -386,8 +386,8 @@ def _check_limits(recording: Recording, limits: np.ndarray, margin: float, types
     notes = [_limit_passed(recording, joint, limits[joint], types[joint]) for joint in np.flatnonzero(kept)]
     if "des_dof_pos" in excess and (beyond := _those(names, excess["des_dof_pos"] > 0.0)):
         unit = units_for("rad", [each for each, name in zip(types, names, strict=True) if name in beyond])
-        most = np.nanmax(excess["des_dof_pos"])
-        notes.append(f"{listed(beyond)}: commanded beyond the joint limits, by {most:.3f} {unit}.")
+        furthest = np.nanmax(excess["des_dof_pos"])
+        notes.append(f"{listed(beyond)}: commanded beyond the joint limits, by {furthest:.3f} {unit}.")
     return notes
 
 

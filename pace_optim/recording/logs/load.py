@@ -309,7 +309,8 @@ def _logs(path: Path, columns: ColumnMap | None) -> Iterator[Log]:
     else:
         raise ValueError(
             f"{path}: found the suffix '{path.suffix}'; expected one of {listed((*SUFFIXES, *LOG_SUFFIXES))}, or a "
-            "folder of a rosbag2 or a LeRobot dataset. Write it as .csv: a line of names, then one row per sample."
+            "folder of a rosbag2 or a LeRobot dataset. Write it as .csv: a line of names, then one row per sample. "
+            "Give gains of all logs with --facts."
         )
 
 
