@@ -383,7 +383,7 @@ def _check_limits(recording: Recording, limits: np.ndarray, margin: float, types
                 f"expected {limits[joint, 0]:.3f} to {limits[joint, 1]:.3f} {unit}, the joint's limits (and at "
                 f"most {allowed[joint]:.3g} beyond). {cure}"
             )
-    notes = [_limit_passed(recording, joint, limits[joint], types[joint]) for joint in np.flatnonzero(kept)]
+    notes = [_limit_passed(recording, joint, limits[joint], types[joint]) for joint in np.flatnonzero(kept).tolist()]
     if "des_dof_pos" in excess and (beyond := _those(names, excess["des_dof_pos"] > 0.0)):
         unit = units_for("rad", [each for each, name in zip(types, names, strict=True) if name in beyond])
         furthest = np.nanmax(excess["des_dof_pos"])

@@ -103,7 +103,8 @@ def _is_impossible(joint: Known, unit: str, joint_type: JointType) -> bool:
     factor, (low, high) = UNITS["dof_pos"][unit], joint.limits
     if not np.isfinite(high - low):
         far = float(np.abs(position).max()) * factor
-        return command is not None and far > (_TURNS if factor == 1.0 else 2 * np.pi if joint_type == "hinge" else np.inf)
+        most = _TURNS if factor == 1.0 else 2 * np.pi if joint_type == "hinge" else np.inf
+        return command is not None and far > most
     widest = max(high - low, _FAR[joint_type])
     if command is not None and np.ptp(position) < _ONE_SCALE * np.ptp(command.values):
         position = command.values if _beyond(command.values * factor, low, high) < widest else position
@@ -162,11 +163,9 @@ def _of_commands(
     if ratios := [ratio for ratio in moved.values() if ratio > 0]:  # one that follows late or too far counts as one
         away = {unit: abs(float(np.median(np.log(ratios))) - np.log(UNITS["dof_pos"][unit])) for unit in (whole, small)}
     else:
-        away = {
-            unit: sum(abs(float(command.mean()) * UNITS["dof_pos"][unit] - position.mean()) for position, command in both.values())
-            for unit in (whole, small)
-        }
-    for unit in {of_positions.get(name) for name in both} & set(away):  # which is likelier than another one
+        means = [(float(position.mean()), float(command.mean())) for position, command in both.values()]
+        away = {unit: sum(abs(c * UNITS["dof_pos"][unit] - q) for q, c in means) for unit in (whole, small)}
+    for unit in {of_positions[name] for name in both} & away.keys():  # which is likelier than another one
         away[unit] *= 0.5
     unit = min(away, key=lambda each: away[each])
     notes = [f"Commands follow the positions as {_WORDS[small]}: all are read so."] if unit == small else []

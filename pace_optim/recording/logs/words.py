@@ -233,7 +233,7 @@ def meaning(name: str, table: str = "", joint: tuple[int, int] | None = None) ->
 
 
 def joint_places(columns: Iterable[str], joint_names: Sequence[str] = ()) -> dict[str, tuple[int, int]]:
-    """Where the names of columns have a joint's, whichever words it has: ``index_q1_pos`` has that of ``index_q1``.
+    """Where a joint's name stands in those of columns, such as ``index_q1`` in ``index_q1_pos``.
 
     1. A name that the robot has; of several the longest.
     2. What a column of positions shares with one of commands: ``JOINT_pos`` and ``JOINT_cmd``. Of several the longest
