@@ -102,13 +102,19 @@ def stated_couplings(paths: Sequence[str | os.PathLike[str]]) -> dict[str, dict[
     return found
 
 
-def without_fact_files(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
-    """Leave out JSON files of facts that lie beside a recording that is listed too, as ``folder/*`` lists them."""
+def without_fact_files(
+    paths: Sequence[str | os.PathLike[str]], facts: str | os.PathLike[str] | None = None
+) -> list[str]:
+    """Leave out JSON files of facts, as ``folder/*`` lists them: those beside a recording, and `facts` of all."""
     recordings = {Path(path).with_suffix("") for path in paths if Path(path).suffix.lower() in SUFFIXES}
+    of_all = [] if facts is None else [Path(facts).resolve()]
     return [
         str(path)
         for path in paths
-        if not (Path(path).suffix.lower() == ".json" and Path(path).with_suffix("") in recordings)
+        if not (
+            Path(path).suffix.lower() == ".json"
+            and (Path(path).with_suffix("") in recordings or Path(path).resolve() in of_all)
+        )
     ]
 
 

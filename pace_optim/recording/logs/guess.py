@@ -19,7 +19,7 @@ from .base import guess_base
 from .column_map import ColumnMap, Source
 from .log import Channel, Log
 from .units import Known, guessed_units
-from .words import CURRENTS, GAINS, NEED_FACTOR, UNITS, joint_places, match, meaning, only_numbers
+from .words import CURRENTS, GAINS, NEED_FACTOR, UNITS, is_other, joint_places, match, meaning, only_numbers
 
 _PLANNED = re.compile(r":(positions|velocities|effort|(desired|reference|output)\.\w+)\[")
 """Of a trajectory or a controller's state: its speeds and torques are those of the plan, which few drives get."""
@@ -94,6 +94,8 @@ def guess_map(log: Log, robot: Robot, channels: Mapping[str, Channel] | None = N
     notes: list[str] = []
     places = joint_places((_own_key(channel) for channel in log.channels.values()), robot.joint_names)
     candidates = [found for channel in log.channels.values() if (found := _candidate(channel, places)) is not None]
+    if robot.joint_names:  # feet may have commands too
+        candidates = [c for c in candidates if not is_other(c.label) or _meant(c.label, robot.joint_names, robot.wanted)]
     candidates = _once(candidates, notes)
     names = robot.joint_names or _own_names(candidates)
     groups: dict[tuple[str, str], list[_Candidate]] = defaultdict(list)

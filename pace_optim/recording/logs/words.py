@@ -375,6 +375,11 @@ def _likeness(label: str, name: str) -> float:
     return 0.0
 
 
+def is_other(label: str) -> bool:
+    """Whether a label has words of other things than joints, such as ``foot``."""
+    return not _OTHER.isdisjoint(words(label))
+
+
 def only_numbers(labels: Iterable[str]) -> bool:
     """Whether labels identify joints by numbers alone."""
     return all(all(word.isdigit() for word in joint_words(label)) for label in labels)

@@ -338,6 +338,7 @@ DEGREES = 180.0 / np.pi
         ),
         ({}, {"joint_order": ("hip", "knee")}, ["'ankle'", "3 joints", "the robot has 2"]),
         ({}, {"joint_order": (*JOINTS, "toe")}, ["no column for toe", "3 joints", "the robot has 4"]),
+        ({"notes": ("Not used: to_pos.",)}, {"joint_order": (*JOINTS, "toe")}, ["for toe.", "Not used: to_pos."]),
         ({"joint_names": ()}, {"joint_order": ("hip", "knee")}, ["3 joints", "2 (hip, knee)"]),
         ({"des_dof_pos": recording().des_dof_pos * [1, np.nan, 1]}, {}, ["knee: no command", "--joints"]),
         ({}, {"joint_order": ("hip", "hip", "knee")}, ["joint_order names a joint twice"]),

@@ -99,3 +99,10 @@ def test_a_last_command_is_no_joint(tmp_path):
     (found,) = understood(path, Robot())
     assert found.recording.joint_names == ("hip",)
     assert "Not used: hip_last_pos, hip_last_cmd, index, motor_index." in found.lines[-1]
+
+
+def test_a_foot_with_commands_is_no_misspelt_joint(tmp_path):
+    path = log_of(tmp_path / "log.csv", ["hip", "foot_x"])
+    (found,) = understood(path, Robot(joint_names=("hip", "knee")))
+    assert found.recording.joint_names == ("hip",)
+    assert "Not used: foot_x_pos, foot_x_cmd." in found.lines[-1]

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ from pace_optim.problem.recordings import _each
 from pace_optim.recording import load_recording
 from pace_optim.recording.files import read_facts, unused_facts
 from pace_optim.recording.logs import LogReader, Robot
+from pace_optim.run.open import input_digests, with_absolute_paths
+from pace_optim.run.settings import FitSettings
 
 TIME = np.arange(600) / 200
 JOINTS = ("index_q1", "thumb_q1")
@@ -137,3 +140,14 @@ def test_import_takes_the_gains(tmp_path):
         )  # fmt: skip
         assert words in done.stdout + done.stderr
     assert load_recording(tmp_path / "out.csv").drive.stiffness.tolist() == [2, 3]
+
+
+def test_a_run_keeps_the_file_of_gains_and_a_folder_may_list_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    log_of(tmp_path / "one.csv")
+    facts = facts_of(tmp_path)
+    settings = FitSettings(task="x", data=["one.csv", "gains.json"], facts="gains.json")
+    assert settings.data == ["one.csv"]
+    kept = with_absolute_paths(settings, None)
+    assert kept.facts == str(facts)
+    assert str(facts) in input_digests(kept, SimpleNamespace(code={}, files={}))
