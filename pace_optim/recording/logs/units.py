@@ -188,14 +188,15 @@ def _of_speeds(
     away = {
         unit: abs(usual + np.log(factor)) for unit, factor in UNITS["dof_vel"].items() if ("m/s" in unit) == slides
     }
-    unit = min(away, key=lambda each: away[each])
+    unit = min(away, key=lambda unit: away[unit])
     if series == "des_dof_vel":
         units = dict.fromkeys(channels, whole if away[whole] < 1.0 or away[unit] > 0.5 else unit)
         strange: dict[str, float] = {}
     else:
-        off = {name: abs(np.log(ratios.get(name, np.exp(usual)) * UNITS["dof_vel"][unit])) for name in channels}
+        each = {name: ratios[name] if name in ratios else float(np.exp(usual)) for name in channels}
+        off = {name: abs(np.log(ratio * UNITS["dof_vel"][unit])) for name, ratio in each.items()}
         units = {name: unit if off[name] < np.log(_NEAR) else "" for name in channels}
-        strange = {name: ratios.get(name, np.exp(usual)) for name in channels if not units[name]}
+        strange = {name: ratio for name, ratio in each.items() if not units[name]}
         strange = {name: ratio for name, ratio in strange.items() if np.any(channels[name].values)}
     word = "Speeds commanded" if series == "des_dof_vel" else "Speeds"
     read = [name for name in units if units[name] not in ("", whole)]
