@@ -10,6 +10,7 @@ from pace_optim.terminal.options import (
     add_common_options,
     add_control_option,
     add_device_option,
+    add_facts_option,
     add_log_options,
     add_rate_option,
     add_several,
@@ -34,6 +35,7 @@ def main() -> None:
     add("--num_envs", type=int, default=512, help="simulations at once in a search (default 512)")
     add_several(parser, "--data", "FILE", "recordings or logs (default: the robot's sample)")
     add_log_options(parser)
+    add_facts_option(parser)
     add_rate_option(parser)
     add("--trust_log", action="store_true", help="fit a log as it is although its checks name a fault, with a warning")
     joints = "joints to identify, the others are held where the log or the keyframe says (default: those of the log)"

@@ -7,9 +7,16 @@ from pathlib import Path
 from pace_actuators.files import refuse_taken
 from pace_actuators.text import listed
 from pace_optim.recording import SUFFIXES, save_recording, written_files
-from pace_optim.recording.logs import Robot, is_log, load_recordings, read_map, understood, with_rate, write_map
+from pace_optim.recording.files import unused_facts
+from pace_optim.recording.logs import LogReader, Robot, is_log, read_map, with_rate, write_map
 from pace_optim.terminal.cli import make_parser
-from pace_optim.terminal.options import add_common_options, add_overwrite_option, add_rate_option, take_common_options
+from pace_optim.terminal.options import (
+    add_common_options,
+    add_facts_option,
+    add_overwrite_option,
+    add_rate_option,
+    take_common_options,
+)
 
 
 def main() -> None:
@@ -24,26 +31,30 @@ def main() -> None:
     parser.add_argument("--columns", metavar="MAP", help="column map (.toml); without it, it is guessed")
     parser.add_argument("--output", metavar="FILE", help="recording to write (.csv, .npz, .pt); episodes get numbers")
     parser.add_argument("--write_map", metavar="MAP", help="write the map that was used, to correct it")
+    add_facts_option(parser)
     add_rate_option(parser)
     add_overwrite_option(parser)
     args = argparse.Namespace(**take_common_options(vars(parser.parse_args())))
 
     path = Path("+".join(args.log))
     columns = with_rate(read_map(Path(args.columns)) if args.columns else None, args.rate)
+    reader = LogReader([str(path)], columns, args.facts)
     if not is_log(path, columns):
-        found = load_recordings(path, columns=columns)
+        found = reader.recordings(str(path), Robot())
         print(f"{path}: is a recording already, of {', '.join(found[0].joint_names) or 'joints without names'}.")
         parts = [(recording, columns) for recording in found]
     else:
         robot = _robot(args.task)
-        each = understood(path, robot, columns)
-        for line in each[0].lines:
+        each = reader.understood(str(path), robot)
+        for line in reader.lines():
             print(line)
         if absent := [name for name in robot.joint_names if name not in each[0].recording.joint_names]:
             print(f"  not in the log: {listed(absent)}; a fit holds them")
         if len(each) > 1:
             print(f"  {len(each)} episodes")
         parts = [(one.recording, one.columns) for one in each]
+    if left := unused_facts(args.log, args.facts):
+        print(f"note: {left}", file=sys.stderr)
     targets = _targets(Path(args.output), len(parts)) if args.output else []
     files = [file for target in targets for file in written_files(target)]
     refuse_taken(files, option="--output", overwrite=args.overwrite)

@@ -425,6 +425,7 @@ def load_problem(
     env_cfg: Any = None,
     joints: str | None = None,
     columns: str | Path | None = None,
+    facts: str | Path | None = None,
     rate: float | None = None,
     strict: bool = False,
     max_duration: float | None = None,
@@ -451,6 +452,7 @@ def load_problem(
         env_cfg: The task's configuration, if it has been loaded; it is not changed.
         joints: Regular expression of the joints to identify; the others are held. ``None``: those of the recordings.
         columns: Column map of logs that are not in this project's own form; ``None``: guessed.
+        facts: JSON file of what is true of all recordings (gains, limits, loads), where they do not state it.
         rate: Rows per second of logs that have no column of time [Hz].
         strict: Whether one recording that cannot be used refuses all, instead of being set aside.
         max_duration: How long each recording may be [s], cut to the parts that move the joints most; ``None``: as long
@@ -472,15 +474,15 @@ def load_problem(
     env = stated.make_env()
     try:
         files = (data or [stated.cfg.sim2real.recording], validation)
-        logs = read_logs(files, env, joints=joints, columns=columns, rate=rate, strict=strict, tell=tell)
+        logs = read_logs(files, env, joints=joints, columns=columns, facts=facts, rate=rate, strict=strict, tell=tell)
         if logs.note:
             tell(f"note: {logs.note}")
-        facts = stated.with_logs(logs)
-        if facts is not stated:
+        known = stated.with_logs(logs)
+        if known is not stated:
             env.close()
-            env = facts.make_env()
+            env = known.make_env()
         return _posed(
-            facts, logs, env, effects, links, unknown, residual, strict=strict, max_duration=max_duration, tell=tell
+            known, logs, env, effects, links, unknown, residual, strict=strict, max_duration=max_duration, tell=tell
         )
     finally:
         env.close()

@@ -19,8 +19,9 @@ from pace_optim.problem.drive_steps import of_joints
 from pace_optim.recording import Recording, conform_recording
 from pace_optim.recording.commands import command_interval
 from pace_optim.recording.conform import of_motors, with_columns
+from pace_optim.recording.files import unused_facts
 from pace_optim.recording.gaps import split_at_gaps
-from pace_optim.recording.logs import Robot, load_recordings, paired_files, read_map, with_rate
+from pace_optim.recording.logs import LogReader, Robot, paired_files, read_map, with_rate
 
 if TYPE_CHECKING:
     from pace_envs import ManagerBasedEnv
@@ -71,6 +72,7 @@ def read_logs(
     *,
     joints: str | None = None,
     columns: str | Path | None = None,
+    facts: str | Path | None = None,
     rate: float | None = None,
     strict: bool = False,
     tell: Callable[[str], None] = tell_on_stderr,
@@ -84,6 +86,7 @@ def read_logs(
         groups: Files and folders, each as :func:`pace_optim.recording.logs.load_recordings` takes it.
         joints: Regular expression of the joints that are to be identified; ``None``: those of the recordings.
         columns: Column map of the logs among them; ``None``: guessed.
+        facts: JSON file of what is true of all of them, where they do not state it.
         rate: Rows per second of logs that have no column of time [Hz].
         strict: Whether one that cannot be used refuses all, instead of being set aside.
         tell: Gets what was understood of logs, and what was set aside.
@@ -96,16 +99,25 @@ def read_logs(
 
     driven = env.scene["robot"].driven
 
+    paths = [paired_files([str(path) for path in group]) for group in groups]
+    reader = LogReader([path for group in paths for path in group], chosen, facts)
+
     def read(path: str) -> list[Recording]:
         try:
-            found = load_recordings(path, known, chosen, tell)
+            found = reader.recordings(path, known)
         except ValueError:
             if not driven.are_coupled or not Path(path).exists():
                 raise
-            found = load_recordings(path, known_joints(env), chosen, tell)
+            found = reader.recordings(path, known_joints(env))
         return [of_motors(recording, driven) for recording in found]
 
-    read_groups = [_each(paired_files([str(path) for path in group]), read, strict, tell) for group in groups]
+    warnings: list[str] = []
+    try:
+        read_groups = [_each(group, read, strict, warnings.append) for group in paths]
+    finally:  # a refusal is easier to understand after how the log was read
+        left = unused_facts([path for group in paths for path in group], facts)
+        for line in (*reader.lines(), *([f"note: {left}"] if left else []), *warnings):
+            tell(line)
     every = [recording for group in read_groups for recording in group]
     kept = wanted or _commanded(every, env)
     held, note = _held(every, [name for name in names if name not in kept], env, is_asked=bool(wanted))
@@ -186,18 +198,19 @@ def _each(
 ) -> list[Recording]:
     """What is read of each item; those that cannot be used are set aside with a warning."""
     result: list[Recording] = []
-    faults: list[str] = []
+    faults: list[tuple[str, str]] = []
     for item in items:
         try:
             result += read(item)
         except ValueError as error:
             if strict or len(items) == 1 or (isinstance(item, str) and not Path(item).exists()):
                 raise
-            faults.append(" ".join(str(error).split()))
+            name = Path(item).name if isinstance(item, str) else item.name
+            faults.append((name, " ".join(str(error).split())))
     if faults and not result:
-        more = f" (The other {len(faults) - 1} files cannot be used either.)" if len(faults) > 1 else ""
-        raise ValueError(faults[0] + more)
-    for fault in faults:
+        (_, first), *others = faults
+        raise ValueError(first + (f" Neither can {listed(name for name, _ in others)} be used." if others else ""))
+    for _, fault in faults:
         tell(f"warning: set aside (--strict would refuse all): {fault} [W20]")
     return result
 

@@ -246,6 +246,8 @@ def _sum(values: np.ndarray, names: tuple[str, ...], row: Mapping[str, float]) -
 
 _STILL = 2e-3  # [rad, of slides m]
 _FAR = 0.5  # [rad, of slides m]
+_FURTHEST = 2.0 * np.pi
+"""Positions and commands further beyond a limit are in another unit, or of another joint [rad, of slides m]."""
 _T = TypeVar("_T")
 _DEGREES = "The values look like degrees: multiply them by pi/180."
 
@@ -275,6 +277,7 @@ def column_order(
             for name in unknown[:3]
         ]
         found += [f"no column for {listed(missing)}."] if missing else []
+        found += [note for note in recording.notes if note.startswith("Not used:")]
         raise ValueError(
             f"{source}: {' '.join(found)} The recording has {len(names)} joints ({listed(names)}), the robot "
             f"has {len(joint_order)} ({listed(joint_order)}). Rename the columns, choose the robot's task, or name the "
@@ -361,25 +364,55 @@ def _check_limits(recording: Recording, limits: np.ndarray, margin: float, types
         for key, values in (("dof_pos", recording.dof_pos), ("des_dof_pos", recording.des_dof_pos))
         if values is not None
     }
-    for key, allowed in (("dof_pos", margin), ("des_dof_pos", 2.0 * np.pi)):
+    over = (excess["dof_pos"] > margin) & (excess["dof_pos"] <= _FURTHEST)
+    doubted = np.array([name not in recording.unit_stated for name in names])
+    kept = over & (_swings_beyond(recording, limits, margin) | (~doubted & (2 * over.sum() < max(len(names), 3))))
+    for key, allowed in (
+        ("dof_pos", np.where(kept, _FURTHEST, margin)),
+        ("des_dof_pos", np.full(len(names), _FURTHEST)),
+    ):
         if key in excess and np.any(excess[key] > allowed):
-            joint = int(np.nanargmax(excess[key]))
+            joint = int(np.nanargmax(np.where(excess[key] > allowed, excess[key], -np.inf)))
             values = getattr(recording, key)[:, joint]
             unit = units_for("rad", [types[joint]])
             cure = "Check the column order, the signs and the zero, or the model's limits."
-            stated = names[joint] in recording.unit_stated
-            if types[joint] == "hinge" and np.abs(values).max() > 2.0 * np.pi and not stated:
+            if types[joint] == "hinge" and np.abs(values).max() > 2.0 * np.pi and doubted[joint]:
                 cure = _DEGREES
             raise ValueError(
                 f"{source}: {key} of {names[joint]} goes from {values.min():.3f} to {values.max():.3f} {unit}; "
                 f"expected {limits[joint, 0]:.3f} to {limits[joint, 1]:.3f} {unit}, the joint's limits (and at "
-                f"most {allowed:.3g} beyond). {cure}"
+                f"most {allowed[joint]:.3g} beyond). {cure}"
             )
+    notes = [_limit_passed(recording, joint, limits[joint], types[joint]) for joint in np.flatnonzero(kept).tolist()]
     if "des_dof_pos" in excess and (beyond := _those(names, excess["des_dof_pos"] > 0.0)):
         unit = units_for("rad", [each for each, name in zip(types, names, strict=True) if name in beyond])
-        most = np.nanmax(excess["des_dof_pos"])
-        return [f"{listed(beyond)}: commanded beyond the joint limits, by {most:.3f} {unit}."]
-    return []
+        furthest = np.nanmax(excess["des_dof_pos"])
+        notes.append(f"{listed(beyond)}: commanded beyond the joint limits, by {furthest:.3f} {unit}.")
+    return notes
+
+
+def _swings_beyond(recording: Recording, limits: np.ndarray, margin: float) -> np.ndarray:
+    """Which joints pass their limits by a swing about their commands, and not by a wrong zero, (n,) bool."""
+    if (target := recording.des_dof_pos) is None:
+        return np.zeros(recording.num_joints, dtype=bool)
+    within = (target.min(axis=0) >= limits[:, 0] - margin) & (target.max(axis=0) <= limits[:, 1] + margin)
+    if len(target) != recording.num_samples:
+        clock = np.linspace(recording.time[0], recording.time[-1], len(target))
+        clock = clock if recording.des_time is None else recording.des_time
+        target = target[np.clip(np.searchsorted(clock, recording.time, side="right") - 1, 0, None)]
+    centred = recording.dof_pos - np.median(recording.dof_pos - target, axis=0)
+    beyond = np.maximum(limits[:, 0] - centred.min(axis=0), centred.max(axis=0) - limits[:, 1])
+    return within & (beyond > margin)
+
+
+def _limit_passed(recording: Recording, joint: int, limits: np.ndarray, joint_type: JointType) -> str:
+    """That a joint passes the limit that the model states, and what to do."""
+    low, high = recording.dof_pos[:, joint].min(), recording.dof_pos[:, joint].max()
+    value, limit = (low, limits[0]) if limits[0] - low > high - limits[1] else (high, limits[1])
+    return (
+        f"{recording.joint_names[joint]} reaches {value:.3f}, beyond its limit of {limit:.3f} "
+        f"{units_for('rad', [joint_type])} in the model. Correct the limit in the model file. [W2]"
+    )
 
 
 def _still_commanded(recording: Recording) -> np.ndarray:

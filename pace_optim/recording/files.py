@@ -12,15 +12,17 @@ import itertools
 import json
 import os
 import re
-from collections.abc import Mapping, Sequence
+import shlex
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import fields as dataclass_fields
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 import torch
 
-from pace_actuators.files import parsed_json, read_tensors, write_atomically, writing
+from pace_actuators.files import file_at, parsed_json, read_tensors, write_atomically, writing
 from pace_actuators.memory import check_memory
 from pace_actuators.text import listed
 from pace_optim.terminal.arrays import read_arrays
@@ -37,19 +39,23 @@ from .keys import (
     JOINT_SERIES,
     POSE_COLUMNS,
     SERIES,
+    as_fact,
     did_you_mean,
 )
 
 SUFFIXES = (".pt", ".npz", ".csv")
 
 
-def load_recording(path: str | os.PathLike[str], rate: float = 0.0) -> Recording:
+def load_recording(
+    path: str | os.PathLike[str], rate: float = 0.0, facts: Mapping[str, Any] | None = None
+) -> Recording:
     """Read a recording and check that it is one; its samples stay as they are in the file.
 
     Args:
         path: A `.pt` (dict of tensors, numbers, text), `.npz` or `.csv` file. A JSON file of the same stem
             beside it may hold the facts (joint_names, stiffness, added_mass, ...).
         rate: Samples per second of a file without time [Hz]; 0: it has time.
+        facts: Those that the file and its JSON file do not state.
 
     Raises:
         ValueError: If the file is missing, unreadable, or not a sound recording; the message says what to do.
@@ -65,10 +71,17 @@ def load_recording(path: str | os.PathLike[str], rate: float = 0.0) -> Recording
         fields, found = read_csv(path)
     else:
         fields = _read_pt(path) if suffix == ".pt" else _read_npz(path)
-    fields = add_json_facts(fields, path)
+    fields = with_shared_facts(add_json_facts(fields, path), facts or {})
     if rate and "time" not in fields and "dof_pos" in fields:
         fields["time"] = np.arange(len(as_array(fields["dof_pos"]))) / rate
-    return check_recording(fields, source=str(path), default_name=path.stem, found=found)
+    recording = check_recording(fields, source=str(path), default_name=path.stem, found=found)
+    return replace(recording, notes=(*recording.notes, *facts_notes(path)))
+
+
+def facts_notes(path: Path) -> list[str]:
+    """What is to be said of the JSON file of facts beside a recording."""
+    beside = path.with_suffix(".json")
+    return [note] if beside.is_file() and (note := read_facts(beside)[1]) else []
 
 
 def stated_couplings(paths: Sequence[str | os.PathLike[str]]) -> dict[str, dict[str, float]]:
@@ -89,13 +102,19 @@ def stated_couplings(paths: Sequence[str | os.PathLike[str]]) -> dict[str, dict[
     return found
 
 
-def without_fact_files(paths: Sequence[str | os.PathLike[str]]) -> list[str]:
-    """Leave out JSON files of facts that lie beside a recording that is listed too, as ``folder/*`` lists them."""
+def without_fact_files(
+    paths: Sequence[str | os.PathLike[str]], facts: str | os.PathLike[str] | None = None
+) -> list[str]:
+    """Leave out JSON files of facts, as ``folder/*`` lists them: those beside a recording, and `facts` of all."""
     recordings = {Path(path).with_suffix("") for path in paths if Path(path).suffix.lower() in SUFFIXES}
+    of_all = [] if facts is None else [Path(facts).resolve()]
     return [
         str(path)
         for path in paths
-        if not (Path(path).suffix.lower() == ".json" and Path(path).with_suffix("") in recordings)
+        if not (
+            Path(path).suffix.lower() == ".json"
+            and (Path(path).with_suffix("") in recordings or Path(path).resolve() in of_all)
+        )
     ]
 
 
@@ -206,26 +225,87 @@ def add_json_facts(fields: dict[str, Any], path: Path) -> dict[str, Any]:
     facts_path = path.with_suffix(".json")
     if not facts_path.is_file():
         return fields
-    try:
-        facts = parsed_json(facts_path.read_text(encoding="utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(
-            f"{facts_path}: is not JSON ({error}). Correct it, or move it away from {path.name}."
-        ) from error
-    if not isinstance(facts, dict):
-        raise ValueError(f"{facts_path}: holds a {type(facts).__name__}; expected {{fact: value}}. Correct it.")
+    facts, _ = read_facts(facts_path, f", or move it away from {path.name}")
     for key, value in facts.items():
-        if key not in FACTS:
-            raise ValueError(
-                f"{facts_path}: unknown fact '{key}'{did_you_mean(key, FACTS)} "
-                f"Facts: {listed(FACTS)}. Rename it, or put free text under 'comment'."
-            )
         if key in fields and not _same(fields[key], value):
             raise ValueError(
                 f"{facts_path}: {key} differs from the one in {path.name}"
                 f"{' (joint names of its columns)' if key == 'joint_names' else ''}. Keep it in one place."
             )
     return {**fields, **facts}
+
+
+def read_facts(path: Path, or_else: str = "", known: Sequence[str] = FACTS) -> tuple[dict[str, Any], str]:
+    """Read a JSON file of facts; its own names of gains are replaced, and a note says so ("" if it has none).
+
+    Args:
+        or_else: What to do if it is not one, beside correcting it.
+        known: The facts that it may hold.
+    """
+    try:
+        content = parsed_json(file_at(path, "Correct the path.").read_text(encoding="utf-8-sig"))
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        raise ValueError(f"{path}: is not JSON ({error}). Correct it{or_else}.") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{path}: holds a {type(content).__name__}; expected {{fact: value}}. Correct it.")
+    named = {key: as_fact(key) for key in content}
+    for key, fact in named.items():
+        if twice := [other for other in named if named[other] == fact and other != key]:
+            raise ValueError(f"{path}: {key} and {listed(twice)} are both {fact}. Keep one of them.")
+        if fact not in known:
+            raise ValueError(
+                f"{path}: unknown fact '{key}'{did_you_mean(key, known)} "
+                f"Facts: {listed(known)}. Rename it, or put free text under 'comment'."
+            )
+    other = [f"{key} as {fact} [{_UNITS_OF_GAINS[fact]}]" for key, fact in named.items() if key != fact]
+    note = f"{path.name}: {listed(other)}." if other else ""
+    return {named[key]: value for key, value in content.items()}, note.replace(": ", ": read ", 1)
+
+
+_UNITS_OF_GAINS = {"stiffness": "N m/rad", "damping": "N m s/rad"}
+
+
+def with_shared_facts(
+    fields: dict[str, Any], facts: Mapping[str, Any], joint_names: Collection[str] = ()
+) -> dict[str, Any]:
+    """The fields with facts that several recordings share, where they state none themselves.
+
+    Args:
+        joint_names: The robot's joints: values of those that the recording lacks are left out.
+    """
+    absent = set(joint_names).difference(as_array(fields.get("joint_names", ())).tolist())
+    shared = {
+        key: {name: each for name, each in value.items() if name not in absent}
+        if isinstance(value, Mapping) and key in DRIVE_FACTS
+        else value
+        for key, value in facts.items()
+    }
+    return {**shared, **fields}
+
+
+def unused_facts(paths: Sequence[str | os.PathLike[str]], facts: str | os.PathLike[str] | None = None) -> str:
+    """Which JSON file of gains lies beside recordings and is of none of them, and what to do; "" if none does.
+
+    Args:
+        facts: The file that is given for all recordings.
+    """
+    used = {Path(path).with_suffix(".json").resolve() for path in paths} | ({Path(facts).resolve()} if facts else set())
+    folders = dict.fromkeys(Path(path).parent for path in paths)
+    for path in (each for folder in folders if folder.is_dir() for each in sorted(folder.glob("*.json"))):
+        of_another = any(path.with_suffix(suffix).exists() for suffix in (*SUFFIXES, ""))
+        if path.resolve() in used or of_another or path.stat().st_size > _LARGEST_FACTS:
+            continue
+        try:
+            content = parsed_json(path.read_text(encoding="utf-8-sig"))
+        except (ValueError, OSError, RecursionError):
+            continue
+        if isinstance(content, dict) and {"stiffness", "damping", "effort_limit"} & {as_fact(key) for key in content}:
+            return f"{path} is not used. If it holds the gains of these logs: --facts {shlex.quote(str(path))}"
+    return ""
+
+
+_LARGEST_FACTS = 1 << 20
+"""Larger JSON files hold other things [bytes]."""
 
 
 def _same(one: Any, other: Any) -> bool:

@@ -50,13 +50,21 @@ _OTHER_WORDS = {
     "foot_force": ("foot_forces", "feet_force", "contact_force", "contact_forces"),
     "base_quat": ("base_orientation", "orientation", "imu_quat", "root_quat"),
     "joint_names": ("joints", "names", "joint_order", "dof_names"),
-    "stiffness": ("kp", "p_gain", "p_gains", "gains_p"),
-    "damping": ("kd", "d_gain", "d_gains", "gains_d"),
+    "stiffness": ("kp", "p_gain", "p_gains", "gains_p", "position_gain", "position_gains"),
+    "damping": ("kd", "d_gain", "d_gains", "gains_d", "velocity_gain", "velocity_gains"),
     "effort_limit": ("torque_limit", "max_torque", "max_effort"),
     "saturation_effort": ("stall_torque", "saturation_torque"),
     "velocity_limit": ("speed_limit", "max_velocity", "no_load_speed"),
 }
 _KEY_OF_WORD = {word: key for key, words in _OTHER_WORDS.items() for word in words}
+SHARED_FACTS = (*DRIVE_FACTS, *LOAD_FACTS, "feet", "imu", "comment")
+"""Facts that may be of several recordings."""
+
+
+def as_fact(name: str) -> str:
+    """The fact that another program's name of a gain means, such as ``kp``; other names as they are."""
+    meant = _KEY_OF_WORD.get(name.lower(), "")
+    return meant if meant in ("stiffness", "damping") else name
 
 
 def closest(name: str, known: Iterable[str]) -> str | None:

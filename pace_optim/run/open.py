@@ -245,6 +245,7 @@ def problem_of(settings: FitSettings, env_cfg: Any = None, tell: Callable[[str],
         env_cfg=env_cfg,
         joints=settings.joints,
         columns=settings.columns,
+        facts=settings.facts,
         rate=settings.rate,
         strict=settings.strict,
         max_duration=settings.max_duration,
@@ -289,8 +290,11 @@ def with_absolute_paths(settings: FitSettings, env_cfg: Any) -> FitSettings:
     """The same settings, which mean the same from any folder; the robot's sample stands in ``data`` where none does."""
     sample = getattr(getattr(env_cfg, "sim2real", None), "recording", None)
     data = settings.data or ([str(sample)] if sample is not None else [])
-    columns = None if settings.columns is None else str(Path(settings.columns).absolute())
-    return replace(settings, data=_absolute(data), validation=_absolute(settings.validation), columns=columns)
+    files = {
+        name: None if value is None else str(Path(value).absolute())
+        for name, value in (("columns", settings.columns), ("facts", settings.facts))
+    }
+    return replace(settings, data=_absolute(data), validation=_absolute(settings.validation), **files)  # type: ignore[arg-type]
 
 
 def recording_digests(settings: FitSettings) -> dict[str, str]:
@@ -309,8 +313,8 @@ def input_digests(settings: FitSettings, record: EnvironmentRecord) -> dict[str,
         for name in (*settings.data, *settings.validation)
         if not name.endswith((".npz", ".pt"))
     ]
-    columns = {} if settings.columns is None else {settings.columns: file_digest(settings.columns)}
-    return {**record.files, **code, **columns, **{str(path): _digest_if_there(path) for path in beside}}
+    given = {name: file_digest(name) for name in (settings.columns, settings.facts) if name is not None}
+    return {**record.files, **code, **given, **{str(path): _digest_if_there(path) for path in beside}}
 
 
 def check_unchanged(run: Run) -> None:

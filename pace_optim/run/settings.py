@@ -98,6 +98,9 @@ class FitSettings:
     columns: str | None = None
     """Column map of logs that are not in this project's own form; ``None``: guessed."""
 
+    facts: str | None = None
+    """JSON file of gains, limits and loads of all recordings that do not state them; ``None``: no such file."""
+
     rate: float | None = None
     """Rows per second of logs that have no column of time [Hz]."""
 
@@ -154,7 +157,8 @@ class FitSettings:
                 raise ValueError(f"{name} is {value}, expected a number > 0.")
         if self.drive_dt is not None and not 0 <= self.drive_dt < float("inf"):
             raise ValueError(f"drive_dt is {self.drive_dt}, expected seconds, or 0 for loops that run continuously.")
-        self.data, self.validation = without_fact_files(self.data), without_fact_files(self.validation)
+        self.data = without_fact_files(self.data, self.facts)
+        self.validation = without_fact_files(self.validation, self.facts)
 
     @property
     def has_own_objective(self) -> bool:

@@ -117,6 +117,7 @@ def replay_in_training(run: str | Path, cfg: ManagerBasedEnvCfg | None = None) -
         env,
         joints=".*",
         columns=settings.columns,
+        facts=settings.facts,
         rate=settings.rate,
         strict=settings.strict,
     )

@@ -105,6 +105,15 @@ def add_rate_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rate", type=number, metavar="HZ", help="rows per second of logs that have no column of time")
 
 
+def add_facts_option(parser: argparse._ActionsContainer) -> None:
+    """Of commands that read logs for the first time."""
+    parser.add_argument(
+        "--facts",
+        metavar="FILE",
+        help="JSON file of gains, limits and loads for all logs; what a log's own JSON states is kept",
+    )
+
+
 def add_log_options(parser: argparse.ArgumentParser) -> None:
     """Options of every command that reads recordings."""
     parser.add_argument(

@@ -20,7 +20,7 @@ from pace_optim.problem.problem import Problem
 from pace_optim.problem.step_error import step_error
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import session_starts
-from pace_optim.recording.noise import lattice_step, noise_floor
+from pace_optim.recording.noise import noise_floor
 from pace_optim.run.result import FitResult
 
 
@@ -40,6 +40,18 @@ class DataCheck:
     """Number of different loads."""
     gains: int = 1
     """Number of different gains."""
+
+
+def encoder_steps(recordings: Sequence[Recording], names: Sequence[str]) -> dict[str, float]:
+    """The steps of positions, {joint: rad}; those finer than the noise are the last digit of a file."""
+    steps = {}
+    for recording in recordings:
+        dt = float(np.median(np.diff(recording.time)))
+        for j, name in enumerate(names):
+            floor = noise_floor(recording.dof_pos[:, j], dt)
+            if floor.lattice is not None and floor.lattice > floor.sigma:
+                steps[name] = floor.lattice
+    return steps
 
 
 def check_data(
@@ -63,14 +75,10 @@ def check_data(
         cfg: What is at the floor.
     """
     data, names, types = problem.dataset, problem.joint_names, problem.joint_types
-    squares, steps = [], {}
+    squares = []
     for recording in data.recordings:
         dt = float(np.median(np.diff(recording.time)))
         squares.append([noise_floor(recording.dof_pos[:, j], dt).sigma ** 2 for j in range(len(names))])
-        for j, name in enumerate(names):
-            step = lattice_step(recording.dof_pos[:, j])
-            if step is not None:
-                steps[name] = step
     noise = torch.tensor(np.sqrt(np.mean(squares, axis=0)))
     numerical = step_error(*whole_robot(problem, base), data.validation)
     sentences = [
@@ -78,7 +86,7 @@ def check_data(
         f"the physics step of {1e3 * problem.physics_dt:g} ms changes the simulation by up to "
         f"{_by_type(numerical, types, _largest)}.",
     ]
-    if steps:
+    if steps := encoder_steps(data.recordings, names):
         coarse = max(steps, key=lambda name: steps[name])
         unit = units_for("mrad", [types[names.index(coarse)]])
         sentences.append(f"The encoders show steps, the largest {1e3 * steps[coarse]:.2g} {unit} ({coarse}).")

@@ -18,8 +18,8 @@ from pace_optim.recording.keys import COMMAND_SERIES, CONDITIONS, JOINT_SERIES, 
 from .base import guess_base
 from .column_map import ColumnMap, Source
 from .log import Channel, Log
-from .units import Known, UnknownUnitError, guessed_units
-from .words import CURRENTS, GAINS, NEED_FACTOR, UNITS, match, meaning, only_numbers
+from .units import Known, guessed_units
+from .words import CURRENTS, GAINS, NEED_FACTOR, UNITS, is_other, joint_places, match, meaning, only_numbers
 
 _PLANNED = re.compile(r":(positions|velocities|effort|(desired|reference|output)\.\w+)\[")
 """Of a trajectory or a controller's state: its speeds and torques are those of the plan, which few drives get."""
@@ -84,14 +84,18 @@ class _Candidate:
     unit: str
 
 
-def guess_map(log: Log, robot: Robot) -> Guess:
+def guess_map(log: Log, robot: Robot, channels: Mapping[str, Channel] | None = None) -> Guess:
     """Find which channel is which series of which joint.
 
     Args:
         robot: The robot, as far as it is known.
+        channels: What units are read from, by key: those of all logs with the same columns (:func:`as_one`).
     """
     notes: list[str] = []
-    candidates = [found for channel in log.channels.values() if (found := _candidate(channel)) is not None]
+    places = joint_places((_own_key(channel) for channel in log.channels.values()), robot.joint_names)
+    candidates = [found for channel in log.channels.values() if (found := _candidate(channel, places)) is not None]
+    if robot.joint_names:  # feet may have commands too
+        candidates = [c for c in candidates if not is_other(c.label) or _meant(c.label, robot.joint_names, robot.wanted)]
     candidates = _once(candidates, notes)
     names = robot.joint_names or _own_names(candidates)
     groups: dict[tuple[str, str], list[_Candidate]] = defaultdict(list)
@@ -119,7 +123,7 @@ def guess_map(log: Log, robot: Robot) -> Guess:
     facts_from = {by[fact].channel.key for by in picked.values() for fact in facts if fact in by}
     notes += more
     picked = _without_plans(picked, notes)
-    sources, more, open_units = _with_units(picked, robot, names)
+    sources, more = _with_units(picked, robot, names, channels or log.channels)
     notes += more
     if not any(s in COMMAND_SERIES for by in sources.values() for s in by):
         _effort_as_command(sources, notes)
@@ -127,7 +131,7 @@ def guess_map(log: Log, robot: Robot) -> Guess:
     enable, more = _enable(switches)
     facts_from |= {channel.key for channel in switches} if enable else set()
     base, of_base = guess_base(log)
-    missing = [*_missing(sources, robot.wanted or _found(sources, robot, candidates) or names), *open_units]
+    missing = _missing(sources, robot.wanted or _found(sources, robot, candidates) or names)
     more = [*more, *of_base, *(_foreign(candidates, robot) if missing else [])]
     return Guess(
         columns=ColumnMap(joints=sources, facts=facts, torque_enable=enable, base=base),
@@ -182,14 +186,19 @@ def _order(entry: tuple[str, object]) -> int:
     return (*JOINT_SERIES, *GAINS.values()).index(entry[0])
 
 
-def _candidate(channel: Channel) -> _Candidate | None:
+def _own_key(channel: Channel) -> str:
+    """Its name without the topic's or file's."""
+    return channel.key.removeprefix(channel.table + ":") if channel.table else channel.key
+
+
+def _candidate(channel: Channel, places: Mapping[str, tuple[int, int]]) -> _Candidate | None:
     if channel.series:
         told = meaning("x", channel.table).commanded and not channel.series.startswith("des_")
         return _Candidate(
             channel=channel, series=("des_" if told else "") + channel.series, label=channel.joint, unit=""
         )
-    name = channel.key.removeprefix(channel.table + ":") if channel.table else channel.key
-    said = meaning(name, channel.table)
+    name = _own_key(channel)
+    said = meaning(name, channel.table, places.get(name))
     if not said.quantity:
         return None
     label = "_".join(said.joint)
@@ -328,10 +337,35 @@ def _without_plans(picked: dict[str, dict[str, _Candidate]], notes: list[str]) -
     return result
 
 
+_PAUSE = 1e3
+"""Between logs that are looked at as one [s]: no slope is seen across it."""
+
+
+def as_one(logs: Sequence[Log]) -> dict[str, Channel]:
+    """The channels of logs that have the same ones, one log after the other."""
+    starts, at = [], 0.0
+    for log in logs:
+        begin = min(float(channel.time[0]) for channel in log.channels.values())
+        starts.append(at - begin)
+        at += max(float(channel.time[-1]) for channel in log.channels.values()) - begin + _PAUSE
+    return {
+        key: replace(
+            channel,
+            time=np.concatenate([log.channels[key].time + start for log, start in zip(logs, starts, strict=True)]),
+            values=np.concatenate([log.channels[key].values for log in logs]),
+        )
+        for key, channel in logs[0].channels.items()
+    }
+
+
 def _with_units(
-    picked: dict[str, dict[str, _Candidate]], robot: Robot, names: Sequence[str]
-) -> tuple[dict[str, dict[str, Source]], list[str], list[str]]:
-    """Where each series comes from, notes, and units that remain unknown."""
+    picked: dict[str, dict[str, _Candidate]], robot: Robot, names: Sequence[str], channels: Mapping[str, Channel]
+) -> tuple[dict[str, dict[str, Source]], list[str]]:
+    """Where each series comes from, and notes.
+
+    Args:
+        channels: What units are read from, by key.
+    """
     groups: dict[tuple[str, str, JointType], dict[str, _Candidate]] = defaultdict(dict)
     stated: dict[str, dict[str, Channel]] = {name: {} for name in names}
     for name, by in picked.items():
@@ -340,13 +374,12 @@ def _with_units(
                 continue
             groups[series, each.unit or each.channel.table, robot.joint_type(name)][name] = each
             if each.unit and each.unit not in NEED_FACTOR:
-                stated[name][series] = _scaled(each.channel, series, each.unit)
-    given = {name: {series: each.channel for series, each in by.items()} for name, by in picked.items()}
+                stated[name][series] = _scaled(channels[each.channel.key], series, each.unit)
+    given = {name: {s: channels[each.channel.key] for s, each in by.items()} for name, by in picked.items()}
     sources: dict[str, dict[str, Source]] = {name: {} for name in names}
     scaled: dict[str, Channel] = {}
     of_positions: dict[str, str] = {}
     notes: list[str] = []
-    unknown: list[str] = []
     for (series, _, _), group in sorted(groups.items(), key=_order_of_group):
         unit = next(iter(group.values())).unit
         if unit in NEED_FACTOR:
@@ -357,20 +390,16 @@ def _with_units(
         units = dict.fromkeys(group, unit)
         if not unit:
             known = {name: robot.known(name, stated[name], given[name]) for name in group}
-            try:
-                units, more = guessed_units(series, known, scaled, of_positions)
-                notes += more
-            except UnknownUnitError as error:
-                units = error.units
-                unknown.append(str(error))
+            units, more = guessed_units(series, known, scaled, of_positions)
+            notes += more
         for name, each in group.items():
             if not units[name]:
                 continue
             sources[name][series] = Source(channel=each.channel.key, unit=units[name])
             if series == "dof_pos":
-                scaled[name] = _scaled(each.channel, series, units[name])
+                scaled[name] = _scaled(channels[each.channel.key], series, units[name])
                 of_positions[name] = units[name]
-    return {name: dict(sorted(by.items(), key=_order)) for name, by in sources.items()}, notes, unknown
+    return {name: dict(sorted(by.items(), key=_order)) for name, by in sources.items()}, notes
 
 
 def _scaled(channel: Channel, series: str, unit: str) -> Channel:

@@ -6,6 +6,7 @@ import csv
 import os
 import shlex
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,13 @@ import numpy as np
 from pace_actuators.text import listed
 from pace_optim.recording import Recording, load_recording
 from pace_optim.recording.checks import check_recording
-from pace_optim.recording.files import SUFFIXES, add_json_facts
-from pace_optim.recording.keys import COMMAND_SERIES, CONDITIONS, MEASURED_SERIES
+from pace_optim.recording.files import SUFFIXES, add_json_facts, facts_notes, read_facts, with_shared_facts
+from pace_optim.recording.keys import COMMAND_SERIES, CONDITIONS, DRIVE_FACTS, MEASURED_SERIES, SHARED_FACTS
 from pace_optim.recording.time_base import interpolate_linear, interpolate_smooth
 
 from .base import base_fields
 from .column_map import ColumnMap, Source, map_text, printable, write_map
-from .guess import Robot, guess_map
+from .guess import Robot, as_one, guess_map
 from .log import Channel, Log
 from .rosbag import read_rosbag
 from .tables import SUFFIXES as TABLES
@@ -32,7 +33,7 @@ LOG_SUFFIXES = (*BAGS, ".parquet", *(each for each in TABLES if each not in SUFF
 _JOIN = "+"
 """Between the files of one log: states.csv+commands.csv."""
 
-__all__ = ["Robot", "Understood", "is_log", "load_recordings", "paired_files", "understood"]
+__all__ = ["LogReader", "Robot", "Understood", "is_log", "load_recordings", "paired_files", "understood"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,14 +60,145 @@ def load_recordings(
         robot: The robot's joints and limits; without it, the log's own names are kept.
         columns: Which column is what; without it, it is guessed.
     """
-    path = Path(path)
-    if not is_log(path, columns):
-        return [load_recording(path, columns.rate if columns else 0.0)]
-    found = understood(path, robot or Robot(), columns)
-    if tell and columns is None:
-        for line in found[0].lines:
-            tell(line)
-    return [each.recording for each in found]
+    reader = LogReader([str(path)], columns)
+    found = reader.recordings(str(path), robot or Robot())
+    for line in reader.lines() if tell else ():
+        tell(line)  # type: ignore[misc]
+    return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Reading:
+    """How one log is read."""
+
+    path: Path
+    log: Log
+    columns: ColumnMap
+    notes: tuple[str, ...]
+
+
+class LogReader:
+    """Reads the files of one command: logs with the same columns have the same units, and are described once."""
+
+    def __init__(
+        self, paths: Sequence[str], columns: ColumnMap | None = None, facts: str | os.PathLike[str] | None = None
+    ):
+        """Args:
+        paths: All files and folders, as :func:`load_recordings` takes one.
+        columns: Which column is what; without it, it is guessed.
+        facts: JSON file of what is true of all recordings, where they do not state it.
+        """
+        self._columns = columns
+        self._facts, note = ({}, "") if facts is None else read_facts(Path(facts), known=SHARED_FACTS)
+        self._note = note
+        self._logs: dict[str, list[Log]] = {}
+        self._alike: dict[frozenset[str], list[Log]] = {}
+        self._together: dict[frozenset[str], dict[str, Channel]] = {}
+        self._readings: dict[str, _Reading] = {}
+        for path in paths:
+            if is_log(Path(path), columns):
+                with suppress(ValueError):  # it is raised when the path's turn comes
+                    self._logs_of(path)
+
+    def recordings(self, path: str, robot: Robot) -> list[Recording]:
+        """The recordings of a file or folder."""
+        if not is_log(Path(path), self._columns):
+            return [load_recording(path, self._columns.rate if self._columns else 0.0, self._facts)]
+        return [each.recording for each in self.understood(path, robot)]
+
+    def understood(self, path: str, robot: Robot) -> list[Understood]:
+        """Read a log and say what was understood."""
+        columns = self._columns
+        self._readings.pop(str(Path(path)), None)
+        try:
+            return [self._read(Path(path), log, robot) for log in self._logs_of(path)]
+        except ValueError as error:
+            if columns is None or columns.source in str(error):
+                raise
+            raise ValueError(f"{error} ({Path(path).name} was read by {columns.source}.)") from None
+
+    def lines(self) -> list[str]:
+        """How the logs were read so far, those that were read alike together."""
+        alike: list[list[_Reading]] = []
+        for reading in self._readings.values():
+            group = next((each for each in alike if each[0].columns.joints == reading.columns.joints), None)
+            if group is None:
+                alike.append([reading])
+            else:
+                group.append(reading)
+        of_facts = [f"note: {self._note}"] if self._note else []
+        return [*(line for group in alike for line in _lines(group)), *of_facts]
+
+    def _logs_of(self, path: str) -> list[Log]:
+        if path not in self._logs:
+            self._logs[path] = list(_logs(Path(path), self._columns))
+            for log in self._logs[path]:
+                self._alike.setdefault(frozenset(log.channels), []).append(log)
+        return self._logs[path]
+
+    def _channels(self, log: Log) -> Mapping[str, Channel]:
+        """What units are read from: the first of all logs with the same columns, one after another."""
+        key = frozenset(log.channels)
+        if key not in self._together:
+            self._together[key] = as_one(self._alike[key][:_ENOUGH])
+        return self._together[key]
+
+    def _read(self, path: Path, log: Log, robot: Robot) -> Understood:
+        used, notes = self._columns, list(log.notes)
+        facts_from: tuple[str, ...] = ()
+        unit_stated = () if used is None else tuple(used.joints)
+        beside = _parts(path)[0]
+        if used is None or not used.joints:
+            guess = guess_map(log, robot, self._channels(log))
+            own, facts_from, unit_stated = guess.columns, guess.facts_from, guess.unit_stated
+            base = own.base if used is None or not used.base.channels else used.base
+            used = own if used is None else replace(used, joints=own.joints, torque_enable=own.torque_enable, base=base)
+            notes += guess.notes
+            if guess.missing:
+                raise ValueError(_what_is_missing(path, log, guess.missing, used, notes))
+            used = replace(used, facts={**own.facts, **used.facts})
+            if twice := [key for key in own.facts if key in add_json_facts({}, beside)]:
+                notes.append(f"{listed(twice)}: as the JSON file beside the log states it, not by the log's columns.")
+                used = replace(used, facts={key: value for key, value in used.facts.items() if key not in twice})
+        names = _joints_of(path, used, robot)
+        fields, more = fields_of(log, used, names)
+        left = unused(log, used, facts_from)
+        notes += [*more, *facts_notes(beside), *([left] if left else [])]
+        reading = _Reading(path=path, log=log, columns=used, notes=tuple(notes))
+        self._readings.setdefault(str(path), reading)
+        fields = with_shared_facts(add_json_facts(fields, beside), self._facts, robot.joint_names)
+        try:
+            recording = check_recording(fields, source=str(path), default_name=log.name)
+        except ValueError as error:
+            if left and _name_others(fields, names):
+                raise ValueError(f"{error} Columns of the log: {left[0].lower()}{left[1:]}") from None
+            raise
+        if len(log.name) > len(path.stem):  # an episode, or a part
+            recording = replace(recording, name=log.name)
+        recording = replace(recording, unit_stated=unit_stated, notes=(*recording.notes, *notes))
+        return Understood(recording=recording, columns=used, lines=tuple(_lines([reading])))
+
+
+_ENOUGH = 20
+"""So many logs with the same columns show their units."""
+
+
+def _name_others(fields: Mapping[str, Any], names: Sequence[str]) -> bool:
+    """Whether facts are of joints that were not found in the log."""
+    return any(not set(fields[key]) <= set(names) for key in DRIVE_FACTS if isinstance(fields.get(key), Mapping))
+
+
+def _lines(readings: Sequence[_Reading]) -> list[str]:
+    """How logs are read that have the same columns; a note of some of them alone names these."""
+    first, *others = readings
+    notes: dict[str, list[str]] = {}
+    for reading in readings:
+        for note in reading.notes:
+            notes.setdefault(note, []).append(reading.path.name)
+    said = [note if len(of) == len(readings) else f"{listed(of)}: {note}" for note, of in notes.items()]
+    paths = listed([str(first.path), *(reading.path.name for reading in others)], 6)
+    rates = rates_of([reading.log for reading in readings], first.columns)
+    return [printable(line) for line in (f"{paths}: read as", *(f"  {line}" for line in (*rates, *said)))]
 
 
 def is_log(path: Path, columns: ColumnMap | None = None) -> bool:
@@ -92,55 +224,14 @@ def _parts(path: Path) -> list[Path]:
 
 
 def understood(path: Path, robot: Robot, columns: ColumnMap | None = None) -> list[Understood]:
-    """Read a log and say what was understood.
+    """Read a log alone and say what was understood.
 
     Args:
         path: As `load_recordings` takes it, less this project's own form.
         robot: The robot's joints and limits, as far as they are known.
         columns: Which column is what; without it, it is guessed.
     """
-    try:
-        return _understood(path, robot, columns)
-    except ValueError as error:
-        if columns is None or columns.source in str(error):
-            raise
-        raise ValueError(f"{error} ({path.name} was read by {columns.source}.)") from None
-
-
-def _understood(path: Path, robot: Robot, columns: ColumnMap | None) -> list[Understood]:
-    result = []
-    for log in _logs(path, columns):
-        used, notes = columns, list(log.notes)
-        facts_from: tuple[str, ...] = ()
-        unit_stated = tuple(columns.joints) if columns is not None else ()
-        beside = _parts(path)[0]
-        if used is None or not used.joints:
-            guess = guess_map(log, robot)
-            own, facts_from, unit_stated = guess.columns, guess.facts_from, guess.unit_stated
-            base = own.base if used is None or not used.base.channels else used.base
-            used = own if used is None else replace(used, joints=own.joints, torque_enable=own.torque_enable, base=base)
-            notes += guess.notes
-            if guess.missing:
-                raise ValueError(_what_is_missing(path, log, guess.missing, used, notes))
-            used = replace(used, facts={**own.facts, **used.facts})
-            if twice := [key for key in own.facts if key in add_json_facts({}, beside)]:
-                notes.append(f"{listed(twice)}: as the JSON file beside the log states it, not by the log's columns.")
-                used = replace(used, facts={key: value for key, value in used.facts.items() if key not in twice})
-        names = _joints_of(path, used, robot)
-        fields, more = fields_of(log, used, names)
-        more += [left] if (left := unused(log, used, facts_from)) else []
-        recording = check_recording(add_json_facts(fields, beside), source=str(path), default_name=log.name)
-        if len(log.name) > len(path.stem):  # an episode, or a part
-            recording = replace(recording, name=log.name)
-        lines = [printable(line) for line in (f"{path}: read as", *rates_of(log, used), *notes, *more)]
-        result.append(
-            Understood(
-                recording=replace(recording, unit_stated=unit_stated, notes=(*recording.notes, *notes, *more)),
-                columns=used,
-                lines=tuple(lines[:1] + [f"  {line}" for line in lines[1:]]),
-            )
-        )
-    return result
+    return LogReader([str(path)], columns).understood(str(path), robot)
 
 
 def paired_files(paths: Sequence[str]) -> list[str]:
@@ -218,7 +309,8 @@ def _logs(path: Path, columns: ColumnMap | None) -> Iterator[Log]:
     else:
         raise ValueError(
             f"{path}: found the suffix '{path.suffix}'; expected one of {listed((*SUFFIXES, *LOG_SUFFIXES))}, or a "
-            "folder of a rosbag2 or a LeRobot dataset. Write it as .csv: a line of names, then one row per sample."
+            "folder of a rosbag2 or a LeRobot dataset. Write it as .csv: a line of names, then one row per sample. "
+            "Give gains of all logs with --facts."
         )
 
 
@@ -422,29 +514,31 @@ def _union(clocks: Sequence[np.ndarray]) -> np.ndarray:
     return np.unique(np.concatenate(list(distinct.values())))
 
 
-def rates_of(log: Log, columns: ColumnMap) -> list[str]:
-    """What was understood, a line for each series: where from, unit, rate and longest gap."""
+def rates_of(logs: Sequence[Log], columns: ColumnMap) -> list[str]:
+    """What was understood of logs with the same columns, a line for each series: where from, unit, rate, longest gap."""
     lines = []
     for series in (*MEASURED_SERIES, *CONDITIONS, *COMMAND_SERIES):
         by = {name: sources[series] for name, sources in columns.joints.items() if series in sources}
-        for names, source, channel in _alike(log, by):
-            gap = float(np.diff(channel.time).max()) if len(channel.time) > 1 else 0.0
+        for names, source in _alike(logs[0], by):
+            channels = [log.channels[source.channel] for log in logs if source.channel in log.channels]
+            gap = max(float(np.diff(each.time).max(initial=0.0)) for each in channels)
+            rates = list(dict.fromkeys(f"{rate:.4g}" for rate in sorted(each.rate for each in channels)))
             lines.append(
                 f"{series:15s} {listed(names, 6)}: {source.channel}{' …' if len(names) > 1 else ''}, "
-                f"{_terms(series, source)}, {len(channel.time)} values at {channel.rate:.4g} Hz, "
-                f"longest gap {gap * 1e3:.4g} ms"
+                f"{_terms(series, source)}, {sum(len(each.time) for each in channels)} values at "
+                f"{' to '.join([rates[0], *rates[1:][-1:]])} Hz, longest gap {gap * 1e3:.4g} ms"
             )
     return lines
 
 
-def _alike(log: Log, by: Mapping[str, Source]) -> list[tuple[list[str], Source, Channel]]:
+def _alike(log: Log, by: Mapping[str, Source]) -> list[tuple[list[str], Source]]:
     """Joints whose channels differ in the joint alone."""
-    groups: dict[tuple[Any, ...], tuple[list[str], Source, Channel]] = {}
+    groups: dict[tuple[Any, ...], tuple[list[str], Source]] = {}
     for name, source in by.items():
         channel = log.channels[source.channel]
         terms = (source.unit, source.sign, source.offset, source.gear_ratio, source.factor)
         key = (channel.table, len(channel.time), *terms)
-        groups.setdefault(key, ([], source, channel))[0].append(name)
+        groups.setdefault(key, ([], source))[0].append(name)
     return list(groups.values())
 
 

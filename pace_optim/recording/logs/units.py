@@ -1,4 +1,4 @@
-"""Units that the log does not state, joint by joint: from ranges, speeds beside slopes, efforts beside gains, noise."""
+"""Units that the log does not state, one for all joints of a series: from speeds, torques beside gains, and ranges."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ import numpy as np
 from pace_actuators.joint_units import JointType, units_for
 from pace_actuators.text import listed
 from pace_optim.recording.keys import CONDITIONS
-from pace_optim.recording.noise import noise_floor
 
 from .log import Channel
 from .words import UNITS
 
-_BEYOND = 0.2
-"""How far beyond a joint's limits positions may be [rad]."""
 _TURNS = 4.0 * np.pi
 """Where no limits are known, commanded positions beyond this are degrees (up to 360), of a slide mm [rad, m]."""
+_FAR: dict[JointType, float] = {"hinge": np.pi, "slide": 1.0}
+"""How far beyond its limits no joint gets, or the width of its range, if that is more [rad, m]."""
+_ONE_SCALE = 10.0
+"""Positions and commands whose motions differ by less are in one unit."""
 _POSITIONS: dict[JointType, tuple[str, str]] = {"hinge": ("rad", "deg"), "slide": ("m", "mm")}
 """What positions are in, and what else they may be in."""
 _WORDS = {"deg": "degrees", "mm": "millimetres"}
@@ -50,15 +51,6 @@ class Known:
     """All its series, as logged."""
 
 
-class UnknownUnitError(ValueError):
-    """Joints may be in either of two units; the message names them."""
-
-    def __init__(self, message: str, units: dict[str, str]) -> None:
-        super().__init__(message)
-        self.units = units
-        """A guess of all, by joint."""
-
-
 def guessed_units(
     series: str, known: Mapping[str, Known], positions: Mapping[str, Channel], of_positions: Mapping[str, str]
 ) -> tuple[dict[str, str], list[str]]:
@@ -68,9 +60,6 @@ def guessed_units(
         series: `dof_pos`, ...
         known: The joints that have it, by name.
         positions: Positions whose unit was found before, in SI units, by joint.
-
-    Raises:
-        UnknownUnitError: If a joint may be in either of two units.
     """
     if series in CONDITIONS:
         return dict.fromkeys(known, next(iter(UNITS[series]))), []
@@ -88,45 +77,42 @@ def guessed_units(
 def _of_positions(
     known: Mapping[str, Known], channels: Mapping[str, Channel], joint_type: JointType
 ) -> tuple[dict[str, str], list[str]]:
+    """Speeds and torques in known units decide. Else positions are in the smaller unit if the other one is impossible
+    on half of the joints that say anything, and the smaller one on no joint."""
     whole, small = _POSITIONS[joint_type]
-    units: dict[str, str] = {}
-    why: dict[str, str] = {}
-    for name, channel in channels.items():
-        joint = known[name]
-        beyond, within = (_outside(channel.values * UNITS["dof_pos"][unit], joint.limits) for unit in (whole, small))
-        limited = all(np.isfinite(joint.limits))
-        if limited and beyond > _BEYOND >= within:
-            units[name], why[name] = small, f"{beyond:.3g} beyond its limits in {whole}"
-        elif by := _by_speeds(joint, whole, small) or _by_gains(joint, whole, small):
-            units[name], why[name] = by, "by its speeds or torques"
-        elif not limited and (furthest := np.abs(channel.values).max()) > _TURNS:
-            far = furthest <= (360.0 if small == "deg" else np.inf)
-            units[name] = small if far and "des_dof_pos" in joint.given else whole
-            why[name] = "and it follows a position" if units[name] == small else ""
-    if small not in units.values():
-        return {name: units.get(name, whole) for name in channels}, []
-    open_ones = [name for name in channels if name not in units]
-    units |= {name: _like_others(name, channels, units, small) for name in open_ones}
-    if unknown := [name for name in open_ones if not units[name]]:
-        ranges = listed(f"{n} ({channels[n].values.min():.3g} to {channels[n].values.max():.3g})" for n in unknown)
-        there = listed(name for name in units if units[name] == small)
-        raise UnknownUnitError(
-            f"the unit of {ranges}: {whole} or {_WORDS[small]}, as {there} {'is' if ',' not in there else 'are'} in",
-            {name: unit or small for name, unit in units.items()},
-        )
-    notes = [
-        f"Positions of {name} reach {np.abs(channels[name].values).max():.4g}"
-        f"{', ' + why[name] if why.get(name) else ''}: read as {_WORDS[small]}."
-        for name in channels
-        if units[name] == small
+    shown = [by for joint in known.values() if (by := _by_speeds(joint, whole, small) or _by_gains(joint, whole, small))]
+    far = [name for name, joint in known.items() if _is_impossible(joint, whole, joint_type)]
+    saying = [name for name, channel in channels.items() if name in far or np.ptp(channel.values) > _STILL]
+    unit = whole
+    if shown.count(small) != shown.count(whole):
+        unit, why = (small if shown.count(small) > shown.count(whole) else whole), "by their speeds or torques"
+    elif far and 2 * len(far) >= len(saying):
+        if not any(_is_impossible(joint, small, joint_type) for joint in known.values()):
+            unit, why = small, f"{listed(far)} would be far outside of the possible range in {whole}"
+    if unit == whole:
+        return dict.fromkeys(channels, whole), []
+    most = max(channels, key=lambda name: np.abs(channels[name].values).max())
+    return dict.fromkeys(channels, small), [
+        f"Positions reach {np.abs(channels[most].values).max():.4g} ({most}): all are read as {_WORDS[small]}, {why}."
     ]
-    if mixed := [name for name in open_ones if units[name] == whole]:
-        notes.append(f"Positions of {listed(mixed)} are read in {whole}: only so their noise is like the others'.")
-    return units, notes
 
 
-def _outside(values: np.ndarray, limits: tuple[float, float]) -> float:
-    return float(max(limits[0] - values.min(), values.max() - limits[1]))
+def _is_impossible(joint: Known, unit: str, joint_type: JointType) -> bool:
+    """Whether a joint cannot be where its numbers are in a unit. A command within its limits says that it can."""
+    position, command = joint.given["dof_pos"].values, joint.given.get("des_dof_pos")
+    factor, (low, high) = UNITS["dof_pos"][unit], joint.limits
+    if not np.isfinite(high - low):
+        far = float(np.abs(position).max()) * factor
+        most = _TURNS if factor == 1.0 else 2 * np.pi if joint_type == "hinge" else np.inf
+        return command is not None and far > most
+    widest = max(high - low, _FAR[joint_type])
+    if command is not None and np.ptp(position) < _ONE_SCALE * np.ptp(command.values):
+        position = command.values if _beyond(command.values * factor, low, high) < widest else position
+    return _beyond(position * factor, low, high) > widest
+
+
+def _beyond(values: np.ndarray, low: float, high: float) -> float:
+    return float(max(low - values.min(), values.max() - high))
 
 
 def _by_speeds(joint: Known, whole: str, small: str) -> str:
@@ -160,96 +146,64 @@ def _nearer(ratio: float, whole: str, small: str) -> str:
     return near if away[near] < np.log(_CLEAR) else ""
 
 
-def _like_others(name: str, channels: Mapping[str, Channel], units: Mapping[str, str], small: str) -> str:
-    """The unit of a joint whose numbers fit both, beside joints in the smaller one: their encoders are alike.
-
-    "" where its noise does not show it.
-    """
-    own = channels[name]
-    if np.ptp(own.values) < _STILL:
-        return small
-    whole = "rad" if small == "deg" else "m"
-    others = [_noise(channels[other]) * UNITS["dof_pos"][units[other]] for other in units if units[other] == small]
-    noise, usual = _noise(own), float(np.median(others))
-    away = {u: abs(np.log(max(noise * UNITS["dof_pos"][u], 1e-12) / max(usual, 1e-12))) for u in (whole, small)}
-    near, far = sorted(away, key=lambda unit: away[unit])
-    clear = away[far] - away[near] >= np.log(_CLEAR) and away[near] <= np.log(10.0)
-    return near if clear else ""
-
-
-def _noise(channel: Channel) -> float:
-    step = float(np.median(np.diff(channel.time))) if len(channel.time) > 1 else 1.0
-    return noise_floor(channel.values, step).sigma
-
-
 def _of_commands(
     channels: Mapping[str, Channel],
     positions: Mapping[str, Channel],
     of_positions: Mapping[str, str],
     joint_type: JointType,
 ) -> tuple[dict[str, str], list[str]]:
-    """A joint moves as far as its command; the command of one that stands has the unit of its position."""
+    """Joints move as far as their commands; commands of joints that stand have the unit of the positions."""
     whole, small = _POSITIONS[joint_type]
-    units = {}
-    for name, channel in channels.items():
-        units[name] = whole
-        if (position := positions.get(name)) is None:
-            continue
-        command = held(channel, position.time)
-        moved, asked = float(np.std(position.values)), float(np.std(command))
-        if moved > 0 and asked > 0:  # a joint that follows late or too far is as far from its command as from none
-            away = {unit: abs(np.log(moved / asked / UNITS["dof_pos"][unit])) for unit in (whole, small)}
-        else:
-            mean = float(position.values.mean())
-            away = {unit: abs(float(command.mean()) * UNITS["dof_pos"][unit] - mean) for unit in (whole, small)}
-        if of_positions.get(name) in away:  # which is likelier than another one
-            away[of_positions[name]] *= 0.5
-        units[name] = min(away, key=lambda unit: away[unit])
-    told = [name for name, unit in units.items() if unit == small]
-    return units, [f"Commands of {listed(told)} follow the positions as {_WORDS[small]}: read so."] if told else []
+    both = {
+        name: (positions[name].values, held(channel, positions[name].time))
+        for name, channel in channels.items()
+        if name in positions
+    }
+    moved = {name: np.std(position) / np.std(command) for name, (position, command) in both.items() if np.std(command)}
+    if ratios := [ratio for ratio in moved.values() if ratio > 0]:  # one that follows late or too far counts as one
+        away = {unit: abs(float(np.median(np.log(ratios))) - np.log(UNITS["dof_pos"][unit])) for unit in (whole, small)}
+    else:
+        means = [(float(position.mean()), float(command.mean())) for position, command in both.values()]
+        away = {unit: sum(abs(c * UNITS["dof_pos"][unit] - q) for q, c in means) for unit in (whole, small)}
+    for unit in {of_positions[name] for name in both} & away.keys():  # which is likelier than another one
+        away[unit] *= 0.5
+    unit = min(away, key=lambda each: away[each])
+    notes = [f"Commands follow the positions as {_WORDS[small]}: all are read so."] if unit == small else []
+    return dict.fromkeys(channels, unit), notes
 
 
 def _of_speeds(
     series: str, channels: Mapping[str, Channel], positions: Mapping[str, Channel], joint_type: JointType
 ) -> tuple[dict[str, str], list[str]]:
-    """By how much speeds are more than the slopes of positions: each joint's that moves, others' as all together."""
-    sums: dict[str, np.ndarray] = {}
+    """The unit in which most joints' speeds are the slopes of their positions; those that are not are left out."""
+    whole, slides = units_for("rad/s", [joint_type]), joint_type == "slide"
+    ratios: dict[str, float] = {}
     for name, channel in channels.items():
-        sums[name] = np.zeros(3)
         if (position := positions.get(name)) is not None and len(position.time) >= 3:
             slope = np.gradient(position.values, position.time)
             speed = np.interp(position.time, channel.time, channel.values)
-            sums[name] = np.array([slope @ speed, slope @ slope, len(slope)])
-    both, power, _ = np.sum(list(sums.values()), axis=0)
-    every = both / power if power > 0 else 1.0
-    whole, slides = units_for("rad/s", [joint_type]), joint_type == "slide"
-    units: dict[str, str] = {}
-    strange: dict[str, float] = {}
-    for name, (own, square, count) in sums.items():
-        ratio = own / square if count and square / count > _MOVES**2 else every
-        away = {
-            unit: abs(np.log(max(ratio, 1e-9) * factor))
-            for unit, factor in UNITS["dof_vel"].items()
-            if ("m/s" in unit) == slides
-        }
-        unit = min(away, key=lambda each: away[each])
-        if series == "des_dof_vel":
-            units[name] = whole if away[whole] < 1.0 or away[unit] > 0.5 else unit
-        elif away[unit] < np.log(_NEAR):
-            units[name] = unit
-        else:
-            units[name] = ""
-            if np.any(channels[name].values):
-                strange[name] = ratio
+            if np.mean(slope**2) > _MOVES**2:
+                ratios[name] = max(float(slope @ speed / (slope @ slope)), 1e-9)
+    usual = float(np.median(np.log(list(ratios.values())))) if ratios else 0.0
+    away = {
+        unit: abs(usual + np.log(factor)) for unit, factor in UNITS["dof_vel"].items() if ("m/s" in unit) == slides
+    }
+    unit = min(away, key=lambda unit: away[unit])
+    if series == "des_dof_vel":
+        units = dict.fromkeys(channels, whole if away[whole] < 1.0 or away[unit] > 0.5 else unit)
+        strange: dict[str, float] = {}
+    else:
+        each = {name: ratios[name] if name in ratios else float(np.exp(usual)) for name in channels}
+        off = {name: abs(np.log(ratio * UNITS["dof_vel"][unit])) for name, ratio in each.items()}
+        units = {name: unit if off[name] < np.log(_NEAR) else "" for name in channels}
+        strange = {name: ratio for name, ratio in each.items() if not units[name]}
+        strange = {name: ratio for name, ratio in strange.items() if np.any(channels[name].values)}
     word = "Speeds commanded" if series == "des_dof_vel" else "Speeds"
-    notes = [
-        f"{word} of {listed(n for n in units if units[n] == unit)}, beside the slopes of positions: read as {unit}."
-        for unit in dict.fromkeys(units.values())
-        if unit not in ("", whole)
-    ]
+    read = [name for name in units if units[name] not in ("", whole)]
+    notes = [f"{word} of {listed(read)}, beside the slopes of positions: read as {units[read[0]]}."] if read else []
     if strange:
-        ratios = listed(f"{name} ({ratio:.3g})" for name, ratio in strange.items())
-        notes.append(f"Speeds are no slopes of positions in any known unit: left out. Times the slope: {ratios}.")
+        ratios_of = listed(f"{name} ({ratio:.3g})" for name, ratio in strange.items())
+        notes.append(f"Speeds are no slopes of positions in any known unit: left out. Times the slope: {ratios_of}.")
     return units, notes
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -83,6 +84,8 @@ _OTHER = {
     "reserve", "seq", "reward", "done", "success", "foot", "tick", "crc", "checksum", "last", "prev", "previous",
     "column", "tcp", "pose", "orientation",
 }  # fmt: skip
+_DERIVED = {"error", "err", "errors", "limit", "min", "max", "std", "last", "prev", "previous"}
+"""Those of them that make another series of a joint's: ``hip_last_pos``."""
 _CONDITIONS = {
     **dict.fromkeys(("temp", "temps", "temperature", "temperatures"), TEMPERATURE),
     **dict.fromkeys(("voltage", "voltages", "volt", "volts", "vbus"), VOLTAGE),
@@ -123,6 +126,14 @@ _UNIT_WORDS = {
 """Not the letters n, m, s and a, which name joints (A1): they are units only where a pattern above says so."""
 
 
+_SEAMS = re.compile(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])|(?<=[A-Za-z])(?=\d)|(?<=\d)(?=[A-Za-z])")
+"""Where a word ends inside of a name without separators."""
+_SERIES = (
+    _COMMAND | _MEASURED | _POSITION | _VELOCITY | _EFFORT | _AMPERES | _UNIT_WORDS | set(GAINS) | set(_CONDITIONS)
+)
+"""Words of a series: they are of no joint's name, unless they stand inside of one (:func:`joint_places`)."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Meaning:
     """What a name says; "" and () where it says nothing."""
@@ -137,22 +148,39 @@ class Meaning:
 
 def words(name: str) -> list[str]:
     """The words of a name in lower case: ``leftHip_J2`` has left, hip, j, 2."""
-    parted = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])|(?<=[A-Za-z])(?=\d)|(?<=\d)(?=[A-Za-z])", " ", name)
-    return [_SIDES.get(word, word) for word in re.split(r"[^a-z0-9°]+", parted.lower()) if word]
+    return [word for word, _, _ in _placed(name)]
+
+
+def _placed(name: str) -> list[tuple[str, int, int]]:
+    """The words of a name, and where each begins and ends in it."""
+    found = []
+    for chunk in re.finditer(r"[A-Za-z0-9°]+", name):
+        at = chunk.start()
+        for part in _SEAMS.split(chunk[0]):
+            found.append((_SIDES.get(part.lower(), part.lower()), at, at + len(part)))
+            at += len(part)
+    return found
 
 
 def joint_words(name: str) -> tuple[str, ...]:
-    """The words that identify a joint."""
+    """The words that identify a joint: of ``q1`` and ``joint_1`` the number."""
     found = tuple(word for word in words(name) if word not in _GENERIC)
+    numbers = tuple(word for word in found if word not in _POSITION)
+    if numbers and all(word.isdigit() for word in numbers):
+        return numbers
     return found or tuple(words(name))
 
 
-def meaning(name: str, table: str = "") -> Meaning:
+def meaning(name: str, table: str = "", joint: tuple[int, int] | None = None) -> Meaning:
     """What a column's name says.
 
     Args:
         table: What names the topic or file, in which a command may be named.
+        joint: Where the joint's name stands in it (:func:`joint_places`): its words say nothing else.
     """
+    whole = name
+    if joint is not None:
+        name = f"{whole[: joint[0]]} {whole[joint[1] :]}"
     unit, of_unit, without_unit = _unit(name)
     own, around = words(name), words(table)
     said = set(own)
@@ -162,12 +190,10 @@ def meaning(name: str, table: str = "") -> Meaning:
         or ("current" in said and not said & _POSITION and not said & _VELOCITY)
         or bool(set(around) & _AMPERES and not said & (_POSITION | _VELOCITY | _EFFORT))
     )
-    spoken = _COMMAND | _MEASURED | _POSITION | _VELOCITY | _EFFORT | _AMPERES | _UNIT_WORDS | set(GAINS) | set(around)
-    spoken |= set(_CONDITIONS)
-    others = said & _OTHER
-    if others == {"index"} and any(word.isalpha() for word in said - others - spoken - _GENERIC):
-        others = set()  # a finger's
-    if others:
+    spoken = _SERIES | set(around)
+    if joint is not None and not own:  # a joint's name alone
+        quantity = POSITION if set(words(whole)) & _POSITION else _of_table(set(), set(around))
+    elif said & _OTHER:
         quantity = ""
     elif said & set(_CONDITIONS):
         quantity = _condition(own, set(around))
@@ -190,13 +216,102 @@ def meaning(name: str, table: str = "") -> Meaning:
     if of_unit == EFFORT and unit in ("%", "permille") and quantity != EFFORT:
         quantity = ""  # part of a range that nothing states
     if quantity == "torque_enable":
-        spoken |= {"enable", "enabled", "on"}
-    joint = tuple(word for word in words(without_unit) if word not in spoken)
+        spoken = spoken | {"enable", "enabled", "on"}
+    label = [word for word in words(without_unit) if word not in spoken]
+    if joint is not None:
+        before, after = (words(text) for text in (whole[: joint[0]], whole[joint[1] :]))
+        of_joint = whole[slice(*joint)]
+        as_one = of_joint if re.fullmatch(r"[\w.-]+", of_joint) else "_".join(words(of_joint))
+        kept = [[word for word in part if word not in spoken and word in label] for part in (before, after)]
+        label = [*kept[0], as_one, *kept[1]]
     if not unit and current and quantity == EFFORT:
         unit = "A"
     if not unit and quantity == EFFORT and said & _EFFORT == {"load"}:
         unit, of_unit = "%", EFFORT  # a servo's register, of a duty or of its largest torque
-    return Meaning(quantity=quantity, commanded=commanded, unit=unit if of_unit in ("", quantity) else "", joint=joint)
+    unit = unit if of_unit in ("", quantity) else ""
+    return Meaning(quantity=quantity, commanded=commanded, unit=unit, joint=tuple(label))
+
+
+def joint_places(columns: Iterable[str], joint_names: Sequence[str] = ()) -> dict[str, tuple[int, int]]:
+    """Where a joint's name stands in those of columns, such as ``index_q1`` in ``index_q1_pos``.
+
+    1. A name that the robot has; of several the longest.
+    2. What a column of positions shares with one of commands: ``JOINT_pos`` and ``JOINT_cmd``. Of several the longest
+       that leaves a word for the series.
+    3. What other columns have where those two kinds have their joints: ``JOINT_vel``, and ``JOINT_pos`` alone.
+    """
+    of_robot = sorted((tuple(words(name)) for name in joint_names), key=len, reverse=True)
+    found: dict[str, tuple[int, int]] = {}
+    splits: dict[str, list[_Split]] = {}
+    nameless = False
+    for column in columns:
+        placed = _placed(column)
+        own = tuple(word for word, _, _ in placed)
+        nameless |= set(own) <= _SERIES
+        if at := next((at for name in of_robot if (at := _where(own, name))), None):
+            found[column] = placed[at.start][1], placed[at.stop - 1][2]
+        else:
+            splits[column] = _splits(placed)
+    every = [(column, split) for column, those in splits.items() for split in those]
+    commanded = {split.joint for _, split in every if split.is_command}
+    pairs = commanded & {split.joint for _, split in every if split.is_position} | ({()} if nameless else set())
+    around = {split.around for _, split in every if split.joint in pairs and (split.is_command or split.is_position)}
+    for column, those in splits.items():
+        of_pair = [split for split in those if split.joint in pairs and not _derived(split.joint, pairs)]
+        like_pair = [split for split in those if split.around in around and not set(split.joint) & _OTHER]
+        if best := max(of_pair or like_pair, key=lambda split: len(split.joint), default=None):
+            found[column] = best.place
+    return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Split:
+    """One way to read a column's name: a joint, and words of a series around it."""
+
+    joint: tuple[str, ...]
+    around: tuple[tuple[str, ...], tuple[str, ...]]
+    """The words before it and after it."""
+    place: tuple[int, int]
+
+    @property
+    def is_command(self) -> bool:
+        return bool({word for part in self.around for word in part} & _COMMAND)
+
+    @property
+    def is_position(self) -> bool:
+        """Whether it is of measured positions; with no word for them, neither end of the joint's name may be one."""
+        said = {word for part in self.around for word in part}
+        if said & (_COMMAND | _VELOCITY | _EFFORT | _AMPERES | set(GAINS) | set(_CONDITIONS)):
+            return False
+        ends = {self.joint[0], self.joint[-1]}
+        return bool(said & _POSITION) or (
+            bool(said & _MEASURED - {"current"}) and not ends & (_POSITION | _VELOCITY | _EFFORT | _AMPERES | {"current"})
+        )
+
+
+def _splits(placed: Sequence[tuple[str, int, int]]) -> list[_Split]:
+    """All ways to take words of a series off a name's ends."""
+    own = tuple(word for word, _, _ in placed)
+    before = len(list(itertools.takewhile(_SERIES.__contains__, own)))
+    after = len(list(itertools.takewhile(_SERIES.__contains__, reversed(own))))
+    return [
+        _Split(joint=own[i:j], around=(own[:i], own[j:]), place=(placed[i][1], placed[j - 1][2]))
+        for i in range(before + 1)
+        for j in range(len(own) - after, len(own) + 1)
+        if j - i < len(own) and not set(own[i:j]) <= _SERIES and own[j - 1] not in _UNIT_WORDS
+    ]
+
+
+def _derived(joint: tuple[str, ...], pairs: Collection[tuple[str, ...]]) -> bool:
+    """Whether a name is that of another joint with a word such as ``last`` or ``error``."""
+    plain = tuple(word for word in joint if word not in _DERIVED)
+    return plain != joint and plain in pairs
+
+
+def _where(own: tuple[str, ...], name: tuple[str, ...]) -> slice | None:
+    """Where a name's words stand in those of a column, one after another."""
+    places = (slice(i, i + len(name)) for i in range(len(own) - len(name) + 1))
+    return next((place for place in places if name and own[place] == name), None)
 
 
 def _condition(own: Sequence[str], around: set[str]) -> str:
@@ -258,6 +373,11 @@ def _likeness(label: str, name: str) -> float:
     if set(one) <= set(other) and not all(word.isdigit() for word in one):
         return 0.8 - 0.01 * len(set(other) - set(one))
     return 0.0
+
+
+def is_other(label: str) -> bool:
+    """Whether a label has words of other things than joints, such as ``foot``."""
+    return not _OTHER.isdisjoint(words(label))
 
 
 def only_numbers(labels: Iterable[str]) -> bool:

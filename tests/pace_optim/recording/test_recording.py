@@ -240,7 +240,7 @@ def test_each_fault_of_a_csv_has_its_message(tmp_path, text, words):
     [
         ("{", ["leg.json", "is not JSON", "leg.pt"]),
         ("[1]", ["leg.json", "holds a list"]),
-        ('{"kp": 20}', ["unknown fact 'kp'", "did you mean 'stiffness'?"]),
+        ('{"stifness": 20}', ["unknown fact 'stifness'", "did you mean 'stiffness'?"]),
         ('{"dampign": 20}', ["unknown fact 'dampign'", "did you mean 'damping'?"]),
         ('{"weather": "rain"}', ["unknown fact 'weather'", "stiffness", "'comment'"]),
         ('{"joint_names": ["a", "b", "c"]}', ["joint_names differs", "leg.pt"]),
@@ -338,6 +338,7 @@ DEGREES = 180.0 / np.pi
         ),
         ({}, {"joint_order": ("hip", "knee")}, ["'ankle'", "3 joints", "the robot has 2"]),
         ({}, {"joint_order": (*JOINTS, "toe")}, ["no column for toe", "3 joints", "the robot has 4"]),
+        ({"notes": ("Not used: to_pos.",)}, {"joint_order": (*JOINTS, "toe")}, ["for toe.", "Not used: to_pos."]),
         ({"joint_names": ()}, {"joint_order": ("hip", "knee")}, ["3 joints", "2 (hip, knee)"]),
         ({"des_dof_pos": recording().des_dof_pos * [1, np.nan, 1]}, {}, ["knee: no command", "--joints"]),
         ({}, {"joint_order": ("hip", "hip", "knee")}, ["joint_order names a joint twice"]),
@@ -389,6 +390,26 @@ def test_what_is_odd_but_possible_is_noted():
         "off in 25% of the samples",
     ):
         assert any(words in note for note in conformed.notes), (words, conformed.notes)
+
+
+@pytest.mark.parametrize("sample", [150, 250])
+def test_a_joint_that_swings_beyond_its_limit_is_kept_with_a_warning(sample):
+    pos = recording().dof_pos.copy()
+    swing = 3.0 * np.exp(-0.5 * ((np.arange(400) - sample) / 20) ** 2)
+    pos[:, 1] += swing
+    (note,) = (note for note in conform(recording(dof_pos=pos), joint_pos_limits=LIMITS).notes if "[W2]" in note)
+    assert note.startswith(f"knee reaches {pos[:, 1].max():.3f}, beyond its limit of {LIMITS[1, 1]:.3f} rad")
+    assert "Correct the limit in the model file" in note
+
+
+def test_a_stated_unit_keeps_one_joint_beyond_its_limit_and_not_all(tmp_path):
+    beyond = recording(dof_pos=recording().dof_pos + [0, 3.0, 0], des_dof_pos=recording().des_dof_pos + [0, 3.0, 0])
+    with pytest.raises(ValueError, match="dof_pos of knee goes from"):
+        conform(beyond, joint_pos_limits=LIMITS)
+    stated = replace(beyond, unit_stated=tuple(JOINTS))
+    assert any("knee reaches" in note for note in conform(stated, joint_pos_limits=LIMITS).notes)
+    with pytest.raises(ValueError, match="dof_pos of"):
+        conform(replace(stated, dof_pos=recording().dof_pos + 3.0), joint_pos_limits=LIMITS)
 
 
 def test_a_multi_turn_joint_without_limits_is_noted_not_refused():

@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from diagnoses import FITS, joint_alone
@@ -11,7 +12,7 @@ from problems import CALM, DT
 
 from pace_actuators.effects import get_effect, probe_points
 from pace_optim.diagnosis.candidates.multistart import multistart
-from pace_optim.diagnosis.checks.data_check import check_data, unstamped
+from pace_optim.diagnosis.checks.data_check import check_data, encoder_steps, unstamped
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.joints.fits import base_fit
 from pace_optim.joints.fits.base_fit import fit_base
@@ -21,6 +22,7 @@ from pace_optim.joints.fits.model import BASE, JointModel, start_values, whole_v
 from pace_optim.joints.fits.reference_update import ReferenceUpdate
 from pace_optim.joints.fits.side_by_side import SideBySide, Slot, _merged
 from pace_optim.joints.simulation import reference_path, twin_problem
+from pace_optim.recording import Recording
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
 
@@ -426,3 +428,12 @@ def test_derivatives_of_error_bars_move_a_joint_by_as_much_as_its_error(bench, m
     rows = descent(began[0]).ask()
     neighbours = rows[1 : 1 + model.most_free, 0] - rows[0, 0]
     assert neighbours.diagonal().abs().tolist() == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize(("step", "said"), [(1e-6, False), (2e-5, False), (1e-3, True)])
+def test_the_last_digit_of_a_file_is_no_step_of_an_encoder(step, said):
+    time = np.arange(2000) / 200
+    noisy = np.sin(3 * time) + 1e-4 * np.random.default_rng(0).normal(size=len(time))
+    position = (np.round(noisy / step) * step)[:, None]
+    one = Recording(name="r", joint_names=("j",), time=time, dof_pos=position, des_dof_pos=position, notes=())
+    assert bool(encoder_steps([one], ["j"])) == said

@@ -139,20 +139,31 @@ def test_a_map_may_say_the_time_alone(tmp_path):
     assert read(path, Robot(), read_map(tmp_path / "map.toml")).recording.time == pytest.approx(TIME)
 
 
-def test_units_are_decided_for_each_joint(tmp_path):
+def test_all_joints_of_a_log_are_in_one_unit(tmp_path):
     degrees = 180 / np.pi
-    columns = arm(q_shoulder=degrees * MOTION, des_shoulder=degrees * TARGET)
+    small = {"q_elbow": degrees * 0.05 * MOTION, "des_elbow": degrees * 0.05 * TARGET}  # 2.3 degrees, within 3 rad
+    columns = arm(q_shoulder=degrees * MOTION, des_shoulder=degrees * TARGET, **small)
+    found = read(table(tmp_path / "log.csv", **columns))
+    assert found.recording.dof_pos == pytest.approx(np.stack([MOTION, 0.05 * MOTION], 1), abs=1e-5)
+    assert found.recording.des_dof_pos == pytest.approx(np.stack([TARGET, 0.05 * TARGET], 1), abs=1e-5)
+    assert any("(shoulder): all are read as degrees" in line for line in found.lines)
+
+
+@pytest.mark.parametrize("reach", [3.9, 7.0, 12.0])
+def test_a_swing_beyond_a_limit_changes_no_unit(tmp_path, reach):
+    columns = arm(q_shoulder=reach / 0.8 * MOTION, des_shoulder=3.5 * TARGET)  # 2.8 rad are commanded, 3 are possible
     found = read(table(tmp_path / "log.csv", **columns)).recording
-    assert found.dof_pos == pytest.approx(np.stack([MOTION, 0.5 * MOTION], 1), abs=1e-5)
-    assert found.des_dof_pos == pytest.approx(np.stack([TARGET, TARGET], 1), abs=1e-5)
+    assert found.dof_pos == pytest.approx(np.stack([reach / 0.8 * MOTION, 0.5 * MOTION], 1), abs=1e-5)
+    assert found.des_dof_pos == pytest.approx(np.stack([3.5 * TARGET, TARGET], 1), abs=1e-5)
 
 
-def test_a_joint_that_may_be_in_either_unit_is_refused_by_name(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    degrees, smooth = 180 / np.pi, 0.4 * np.sin(3 * TIME)
-    noise = 1e-3 * np.random.default_rng(1).normal(size=len(TIME))  # neither as in degrees nor as in rad
-    with pytest.raises(ValueError, match=r"missing the unit of elbow .*: rad or degrees"):
-        read(table(tmp_path / "log.csv", **arm(q_shoulder=degrees * MOTION, q_elbow=smooth + noise)))
+def test_one_impossible_joint_of_many_changes_no_unit(tmp_path):
+    names = [f"j{i}" for i in range(5)]
+    robot = Robot(joint_names=tuple(names), limits=np.full((5, 2), [-3.0, 3.0]))
+    columns = {f"{name}_pos": MOTION * (60 if name == "j2" else 1) for name in names}
+    columns |= {f"{name}_cmd": TARGET * (60 if name == "j2" else 1) for name in names}
+    found = read(table(tmp_path / "log.csv", time=TIME, **columns), robot).recording
+    assert found.dof_pos[:, 0] == pytest.approx(MOTION, abs=1e-5)
 
 
 def test_a_wheel_that_is_told_speeds_turns_in_rad(tmp_path):
