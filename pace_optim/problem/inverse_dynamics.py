@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -32,7 +33,10 @@ class LinkMotion:
     """Torques of all degrees of freedom on a base that rests, (K, nv) [N m]."""
     bias: np.ndarray
     """Their part that the base changes, (K, nv) [N m]."""
-    state: FrameState
+    posture: np.ndarray
+    """(K, nq)."""
+    velocity: np.ndarray
+    """(K, nv)."""
     following: np.ndarray
     """T of the driven joints, (K, nv, n), or (1, nv, n) where it is the same in all postures."""
 
@@ -69,13 +73,30 @@ class LinkMotion:
             posture, velocity, change, following = loops.along(posture, velocity, change, dof)
         data = mujoco.MjData(links)
         torque, bias = np.empty((2, len(position), model.nv))
-        state = FrameState.empty(links, len(position))
         for k in range(len(position)):
             data.qpos[:], data.qvel[:], data.qacc[:] = posture[k], velocity[k], change[k]
             mujoco.mj_inverse(links, data)
             torque[k], bias[k] = data.qfrc_inverse, data.qfrc_bias
+        return cls(
+            model=links,
+            driven=driven,
+            at_rest=torque,
+            bias=bias,
+            posture=posture,
+            velocity=velocity,
+            following=following,
+        )
+
+    @cached_property
+    def _state(self) -> FrameState:
+        """What a base that moves acts on."""
+        state, data = FrameState.empty(self.model, len(self.posture)), mujoco.MjData(self.model)
+        for k in range(len(self.posture)):
+            data.qpos[:], data.qvel[:] = self.posture[k], self.velocity[k]
+            mujoco.mj_fwdPosition(self.model, data)
+            mujoco.mj_fwdVelocity(self.model, data)
             state.keep(k, data)
-        return cls(model=links, driven=driven, at_rest=torque, bias=bias, state=state, following=following)
+        return state
 
     def torque(self, frame: np.ndarray | None = None, point: np.ndarray | None = None) -> np.ndarray:
         """Torques of the joints, (K, n) [N m].
@@ -86,7 +107,7 @@ class LinkMotion:
         """
         torque = self.at_rest
         if frame is not None and point is not None:
-            torque = torque - self.bias + bias_in_frame(self.model, self.state, frame, point)
+            torque = torque - self.bias + bias_in_frame(self.model, self._state, frame, point)
         return self.driven.efforts_of_motors((torque[:, None] @ self.following)[:, 0])
 
 

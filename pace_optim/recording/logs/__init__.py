@@ -4,11 +4,12 @@
 """
 
 from .column_map import ColumnMap, read_map, with_rate, write_map
-from .load import Robot, is_log, load_recordings, paired_files, understood
+from .load import Robot, column_names, is_log, load_recordings, paired_files, understood
 
 __all__ = [
     "ColumnMap",
     "Robot",
+    "column_names",
     "is_log",
     "load_recordings",
     "paired_files",
