@@ -167,7 +167,9 @@ class ClosedLoops:
             return posture, own @ at.T, faster @ at.T, at[None]
         posture, there = np.empty_like(qpos), np.empty((len(qpos), self.model.nv, own.shape[1]))
         turning, near = np.empty_like(there), qpos[0] if len(qpos) else None
-        places = np.setdiff1d(np.arange(self.model.nq), [self.model.jnt_qposadr[self.model.dof_jntid[d]] for d in driven])
+        places = np.setdiff1d(
+            np.arange(self.model.nq), [self.model.jnt_qposadr[self.model.dof_jntid[d]] for d in driven]
+        )
         for k in range(len(qpos)):
             wanted = qpos[k].copy()
             wanted[places] = near[places]  # in the assembly of the instant before

@@ -346,7 +346,7 @@ def _motors(root: ElementTree.Element, path: Path) -> tuple[dict[str, dict[str, 
     notes = []
     if rows:
         notes.append(
-            f"{listed(list(dict.fromkeys(joint for row in rows.values() for joint in row)))}: coupled by a transmission. "
+            f"{listed(list(dict.fromkeys(j for row in rows.values() for j in row)))}: coupled by a transmission. "
             f"Drives are the joints', or those of {listed(list(rows))} where a log has these columns"
         )
     if left_out:

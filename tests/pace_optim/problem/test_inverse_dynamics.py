@@ -19,7 +19,8 @@ FOUR_BAR = """
   <body name="a"><joint name="root" axis="0 1 0"/>
     <geom type="capsule" fromto="0 0 0 0 0 0.1" size="0.01" mass="0.1"/>
     <body name="c" pos="0 0 0.1"><joint name="knee" axis="0 1 0"/>
-      <geom type="capsule" fromto="0 0 0 0.25 0 0" size="0.01" mass="0.2"/><site name="end" pos="0.25 0 0"/></body></body>
+      <geom type="capsule" fromto="0 0 0 0.25 0 0" size="0.01" mass="0.2"/>
+      <site name="end" pos="0.25 0 0"/></body></body>
   <body name="d" pos="0.25 0 -0.05"><joint name="rear" axis="0 1 0"/>
     <geom type="capsule" fromto="0 0 0 0 0 0.15" size="0.01" mass="0.1"/><site name="top" pos="0 0 0.15"/></body>
 </worldbody><equality><connect site1="end" site2="top"/></equality></mujoco>
