@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -180,6 +181,18 @@ class ClosedLoops:
             turning[k] = (self.following(self._moved(near, step * speed))[:, driven] - there[k]) / step
         follows = np.einsum("kij,kj->ki", there, own)
         return posture, follows, np.einsum("kij,kj->ki", there, faster) + np.einsum("kij,kj->ki", turning, own), there
+
+    @cached_property
+    def carrying(self) -> np.ndarray | None:
+        """T' where all constraints are linear, (nv, nv): passive joints' torques on the driven joints; else ``None``.
+
+        Passive joints keep theirs.
+        """
+        if not self._is_linear:
+            return None
+        result = self.following(self.close(self.model.qpos0.copy())).T
+        result[self.passive] = np.eye(self.model.nv)[self.passive]
+        return result
 
     @property
     def _is_linear(self) -> bool:
