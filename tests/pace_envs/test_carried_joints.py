@@ -1,5 +1,6 @@
 """A drive carries the joints that follow its own by a ratio, in every simulation of it."""
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -7,6 +8,7 @@ import torch
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.compiler import host
 from pace_envs.from_model import cfg_from_model
+from pace_envs.from_model.robot import read_robot
 from pace_optim.joints.simulation import reference_path, twin_problem
 from pace_optim.problem.inverse_dynamics import LinkMotion
 from pace_optim.problem.problem import load_problem
@@ -37,6 +39,15 @@ def test_the_load_of_a_driven_joint_is_that_of_inverse_dynamics(model):
         env.sim.step()  # the torques are those at its beginning
         expected = LinkMotion.of(env.sim.model, ["root"], np.array([[position]]), still, still).torque()
         assert -robot.load_effort.item() == pytest.approx(expected.item(), rel=1e-3)
+
+
+def test_the_scale_of_a_joint_has_what_follows_it(model):
+    (joint,), compiled = read_robot(model).joints, mujoco.MjModel.from_xml_path(str(model))
+    at = np.array([[joint.home]])
+    still, unit = np.zeros((1, 1)), np.ones((1, 1))
+    gravity = LinkMotion.of(compiled, ["root"], at, still, still).torque().item()
+    assert joint.gravity == pytest.approx(abs(gravity))
+    assert joint.inertia == pytest.approx(LinkMotion.of(compiled, ["root"], at, still, unit).torque().item() - gravity)
 
 
 def test_compiled_drives_and_joints_alone_carry_them_too(model, tmp_path, monkeypatch):
