@@ -4,7 +4,7 @@
    has fewer valleys.
 2. Where that ends above the noise, and the rate of the drives' loops is assumed, descend with others. The way goes on
    with one that explains more.
-3. Where that ends far above the noise, and far above the error of the torques that no parameter makes, search the
+3. Where that ends far above the noise, and above the error of the torques that no parameter makes, search the
    pieces around the best end by CMA-ES, one strategy for each kinematic tree. Armatures, frictions and the like are
    searched by magnitude. The search may simulate a stated multiple of what the descents took. Descend again from its
    best.
@@ -50,6 +50,9 @@ class WayDownCfg:
 
     far: float = 3.0
     """Times the noise above which the end of a descent on pieces may be a wrong valley."""
+
+    more: float = 1.5
+    """Times the error of missing physics above which it may be one too."""
 
     search_budget: float = 2.0
     """Simulations of the search, in multiples of what the descents on pieces took."""
@@ -130,8 +133,8 @@ class WayDown:
 
     def is_far(self, score: float) -> bool:
         """Whether a score is above the noise and what missing physics leaves by more than a wrong valley may add."""
-        known = max(self.noise_score, self.missing_score)
-        return score > self.cfg.far**2 * known and score > self.cfg.on_pieces.target_score
+        explained = max(self.cfg.far**2 * self.noise_score, self.cfg.more**2 * self.missing_score)
+        return score > explained and score > self.cfg.on_pieces.target_score
 
     def _of(self, stage: str) -> list[Descent]:
         """A stage's descents so far."""

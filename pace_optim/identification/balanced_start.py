@@ -96,13 +96,13 @@ def _left_over(
 
     A position loop gives way by e = τ / (kp + g') to a torque τ that is slow against it, with g' the slope of what the
     links take. Encoder biases take the place of the constant: they change the torques of links alone. Joints whose
-    torques balance count nothing, nor do those whose gains are assumed, or that have no position loop.
+    torques balance count nothing, nor do those without a position loop.
     """
     result, slopes = 0.0, [_slopes(*each) for each in seen]
     most = seen[0][0].most_bias
     for j in joints:
         loops = [view.stiffness[j] for view, _ in seen]
-        if any(view.assumed[j] for view, _ in seen) or not min(loops) > 0:
+        if not min(loops) > 0:
             continue
         table, torque = _balance(seen, counts, j, delay)
         biases = np.concatenate([each[count[:, j], j] for each, count in zip(slopes, counts, strict=True)])
