@@ -167,7 +167,7 @@ class ClosedLoops:
             posture[:, places] = first[places] + moved @ at[self.passive].T
             return posture, own @ at.T, faster @ at.T, at[None]
         posture, there = np.empty_like(qpos), np.empty((len(qpos), self.model.nv, own.shape[1]))
-        turning, near = np.empty_like(there), qpos[0] if len(qpos) else None
+        turning, near = np.empty_like(there), qpos[0] if len(qpos) else self.model.qpos0
         places = np.setdiff1d(
             np.arange(self.model.nq), [self.model.jnt_qposadr[self.model.dof_jntid[d]] for d in driven]
         )

@@ -55,7 +55,7 @@ class LeastSquaresCfg:
     near_enough: float = 2e-3
     """A descent by derivatives of a longer physics step ends when an iteration lowers the score by less than this part
     of it: the look for the error bars takes the rest. A rough simulation goes on with derivatives at the fit's step.
-    Where the score is k² times that of the noise, k² times as much."""
+    Where the score is k² times that of the noise, k² times as much, and derivatives of any step."""
 
     loosest_enough: float = 2e-3
     """The largest such part."""
@@ -240,8 +240,10 @@ def _iterate(
             break
     gained = descent.scores[-2] - descent.scores[-1]
     longer = jacobian is not None and evaluator.looks_coarser and not descent.own_step
-    beside = longer and gained <= cfg.enough(descent.score) * descent.score
-    if beside and descent.noise >= ROUGH * descent.score**0.5 and descent.iteration < cfg.max_iteration:
+    enough = cfg.enough(descent.score)
+    far = enough > cfg.near_enough
+    beside = (longer or far) and gained <= enough * descent.score
+    if beside and not far and descent.noise >= ROUGH * descent.score**0.5 and descent.iteration < cfg.max_iteration:
         descent.own_step, descent.damping = True, FIRST_DAMPING
         descent.gradient, descent.refused = None, 0
         return
