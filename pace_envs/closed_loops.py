@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -20,6 +21,9 @@ _RATTLES = 0.01
 """A joint that the loops leave free leans on its stop on average, if it is nearer to it than this part of its range."""
 _FOLLOWS = 1e-6
 """Speeds follow when their constraints are met within this part of the driven joints' speed."""
+_SINGLE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+_TURN = 1e-4
+"""Largest motion of a joint over which the change of T is taken [rad or m]."""
 _ON_THE_WAY = 20
 """Intermediate postures between a closed one and one that Newton's method does not reach at once."""
 
@@ -137,6 +141,73 @@ class ClosedLoops:
             if np.abs(jacobian @ result[:, driven]).max(initial=0.0) <= _FOLLOWS or len(free) == len(self.passive):
                 break
         return result
+
+    def along(
+        self, qpos: np.ndarray, qvel: np.ndarray, qacc: np.ndarray, driven: Sequence[int]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """A motion of K instants whose passive joints follow the driven ones.
+
+            v = T v_d,    a = T a_d + Ṫ v_d
+
+        Args:
+            qpos: Postures, (K, nq).
+            qvel: Speeds, (K, nv).
+            qacc: Accelerations, (K, nv).
+            driven: Degrees of freedom that count, (n,).
+
+        Returns:
+            Postures, speeds and accelerations; T, (K, nv, n), or (1, nv, n) where all constraints are linear.
+        """
+        own, faster = qvel[:, driven], qacc[:, driven]
+        if self._is_linear and len(qpos):
+            first, posture = self.close(qpos[0]), qpos.copy()
+            at = self.following(first)[:, driven]
+            places = self.model.jnt_qposadr[self.model.dof_jntid[self.passive]]
+            moved = (qpos - qpos[0])[:, self.model.jnt_qposadr[self.model.dof_jntid[list(driven)]]]
+            posture[:, places] = first[places] + moved @ at[self.passive].T
+            return posture, own @ at.T, faster @ at.T, at[None]
+        posture, there = np.empty_like(qpos), np.empty((len(qpos), self.model.nv, own.shape[1]))
+        turning, near = np.empty_like(there), qpos[0] if len(qpos) else self.model.qpos0
+        places = np.setdiff1d(
+            np.arange(self.model.nq), [self.model.jnt_qposadr[self.model.dof_jntid[d]] for d in driven]
+        )
+        for k in range(len(qpos)):
+            wanted = qpos[k].copy()
+            wanted[places] = near[places]  # in the assembly of the instant before
+            posture[k] = near = self.close(wanted)
+            there[k] = self.following(near)[:, driven]
+            speed = there[k] @ own[k]
+            step = _TURN / max(float(np.abs(speed).max(initial=0.0)), 1e-12)
+            turning[k] = (self.following(self._moved(near, step * speed))[:, driven] - there[k]) / step
+        follows = np.einsum("kij,kj->ki", there, own)
+        return posture, follows, np.einsum("kij,kj->ki", there, faster) + np.einsum("kij,kj->ki", turning, own), there
+
+    @cached_property
+    def carrying(self) -> np.ndarray | None:
+        """T' where all constraints are linear, (nv, nv): passive joints' torques on the driven joints; else ``None``.
+
+        Passive joints keep theirs.
+        """
+        if not self._is_linear:
+            return None
+        result = self.following(self.close(self.model.qpos0.copy())).T
+        result[self.passive] = np.eye(self.model.nv)[self.passive]
+        return result
+
+    @property
+    def _is_linear(self) -> bool:
+        """Whether each passive joint is a linear function of others: all active constraints are such."""
+        model = self.model
+        active = model.eq_active0.astype(bool)
+        linear = np.isin(model.eq_type, [mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtEq.mjEQ_TENDON])
+        spatial = bool(np.isin(model.wrap_type, [mujoco.mjtWrap.mjWRAP_JOINT], invert=True).any())
+        single = np.isin(model.jnt_type[model.dof_jntid[self.passive]], _SINGLE).all()
+        return bool(
+            single
+            and (linear | ~active).all()
+            and not model.eq_data[active, 2:5].any()
+            and not (spatial and (model.eq_type[active] == mujoco.mjtEq.mjEQ_TENDON).any())
+        )
 
     def gap(self, qpos: np.ndarray) -> tuple[float, str]:
         """How far the loops of a posture (nq,) are from closed [m or rad], and the worst constraint's name."""

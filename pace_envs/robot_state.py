@@ -219,6 +219,8 @@ class RobotState:
                 f"The motors {listed(motors)} move several joints together, which is simulated on the processor alone. "
                 'Use sim.device = "cpu" (--device cpu).'
             )
+        if self._loops is not None and sim.coordinates is None and (carrying := self._loops.carrying) is not None:
+            sim.carrying = sim.tensor(carrying)
         self._initial_root = sim.tensor([*init.pos, *init.rot, *init.lin_vel, *init.ang_vel])
 
     @property

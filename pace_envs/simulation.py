@@ -172,6 +172,8 @@ class Simulation:
         self._link_places: dict[int, tuple[torch.Tensor, ...]] = {}
         self._frame: _Frame | None = None
         self.coordinates: MotorCoordinates | None = None
+        self.carrying: torch.Tensor | None = None
+        """What driven joints carry of joints that follow them, (nv, nv): see ``ClosedLoops.carrying``."""
         self.friction_time: torch.Tensor | None = None
         self._as_armature: torch.Tensor | None = None
         """Of damping, in the inertia that was computed last, (num_envs, nv) [kg m²]; only where friction is soft."""
@@ -195,8 +197,12 @@ class Simulation:
 
     @property
     def qfrc_bias(self) -> torch.Tensor:
-        """Torque of gravity and of the motion, with the sign of MuJoCo, (num_envs, nv) [N m]."""
+        """Torque of gravity and of the motion, with the sign of MuJoCo, (num_envs, nv) [N m].
+
+        Driven joints carry those that follow them by a ratio.
+        """
         bias = self._own_bias if self._bias is None else self._bias
+        bias = bias if self.carrying is None else bias @ self.carrying.T
         return bias if self.coordinates is None else self.coordinates.efforts_of_motors(bias)
 
     @cached_property

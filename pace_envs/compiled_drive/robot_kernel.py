@@ -100,6 +100,7 @@ class CompiledRobot:
             robot.num_joints,
             mujoco.mj_versionString(),
             sim.coordinates,
+            sim.carrying,
         )
         series = [self._one(name).double() for name in self._source.series]
         self._series = torch.stack(series).contiguous() if series else torch.zeros(1, dtype=torch.float64)

@@ -78,6 +78,7 @@ def robot_source(
     num_joints: int,
     version: str,
     coordinates: MotorCoordinates | None = None,
+    carrying: torch.Tensor | None = None,
 ) -> RobotSource:
     """C of all drives of a robot.
 
@@ -86,9 +87,14 @@ def robot_source(
         dof: Where its speed is, (n,).
         version: MuJoCo's, whose structures are used.
         coordinates: Of motors that move several joints, if any do.
+        carrying: What driven joints carry of joints that follow them, (nv, nv), if any do.
     """
     turns = "" if coordinates is None else coordinates.c_source()
     there, back = ("to_joints(m, d);", "to_motors(m, d);") if turns else ("", "")
+    if carrying is not None:
+        shares = carrying - torch.eye(len(carrying), dtype=carrying.dtype)
+        places = [(i, j, float(shares[i, j])) for i, j in shares.nonzero().tolist()]
+        back = " ".join(f"d->qfrc_bias[{i}] += {share!r} * d->qfrc_bias[{j}];" for i, j, share in places) + back
     series = tuple(dict.fromkeys(name for program in programs for name in program.tape.series))
     drives = [_Drive(i, program, series, num_joints) for i, program in enumerate(programs)]
     *begins, memory = accumulate((drive.memory for drive in drives), initial=0)

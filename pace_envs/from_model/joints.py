@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
+from pace_envs.closed_loops import ClosedLoops
 from pace_envs.from_model import defaults
 from pace_envs.from_model.actuators import FileDrive, Kind
 from pace_envs.motor_coordinates import DrivenJoints, joint_ranges
@@ -73,13 +74,14 @@ def joint_facts(
     dofs, turn = [int(place.dofadr[0]) for place in places], driven.inverse
     own = copy.copy(model)  # without what drives leave to the simulation
     driven.clear(own)
-    data = mujoco.MjData(own)
-    data.qpos[:] = home
+    data, loops = mujoco.MjData(own), ClosedLoops.of_model(own, dofs)
+    data.qpos[:] = posture = home if loops is None else loops.close(home)
+    follow = (np.eye(model.nv) if loops is None else loops.following(posture))[:, dofs]  # a drive carries what follows
     mujoco.mj_forward(own, data)
     mass = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(own, data, mass)
-    inertia = np.diag(turn.T @ mass[np.ix_(dofs, dofs)] @ turn)
-    gravity = driven.efforts_of_motors((data.qfrc_bias - data.qfrc_gravcomp)[dofs])
+    inertia = np.diag(turn.T @ follow.T @ mass @ follow @ turn)
+    gravity = driven.efforts_of_motors((data.qfrc_bias - data.qfrc_gravcomp) @ follow)
     limits = driven.range_within(joint_ranges(model, driven.joints), home[[int(place.qposadr[0]) for place in places]])
     at_home = driven.to_motors(home[[int(place.qposadr[0]) for place in places]])
     result = []

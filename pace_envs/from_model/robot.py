@@ -234,8 +234,12 @@ def _drive_cfg(joints: Sequence[JointFacts], longest_delay: float, *, continuous
 
 
 def _to_drive(model: mujoco.MjModel, file: ModelFile) -> list[str]:
-    """What to drive where the file has no actuators: joints that it names, else all that follow no other; motors."""
-    return _with_motors(_joints_to_drive(model, file), {} if file.urdf is None else file.urdf.motors)
+    """What to drive where the file has no actuators: joints that it names, else all that follow no other."""
+    if file.urdf is not None and file.urdf.driven:
+        return [name for name in (model.joint(j).name for j in range(model.njnt)) if name in file.urdf.driven]
+    single = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    follow = followers(model)
+    return [model.joint(j).name for j in range(model.njnt) if int(model.jnt_type[j]) in single and j not in follow]
 
 
 def _with_motors(names: Sequence[str], motors: Rows) -> list[str]:
@@ -245,14 +249,6 @@ def _with_motors(names: Sequence[str], motors: Rows) -> list[str]:
         if motor not in result and (place := next((j for j in row if j in result and j not in motors), "")):
             result[result.index(place)] = motor
     return result
-
-
-def _joints_to_drive(model: mujoco.MjModel, file: ModelFile) -> list[str]:
-    if file.urdf is not None and file.urdf.driven:
-        return [name for name in (model.joint(j).name for j in range(model.njnt)) if name in file.urdf.driven]
-    single = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-    follow = followers(model)
-    return [model.joint(j).name for j in range(model.njnt) if int(model.jnt_type[j]) in single and j not in follow]
 
 
 def _base_pose(robot: Robot) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:

@@ -18,7 +18,6 @@ import numpy as np
 from pace_actuators.memory import available_memory
 from pace_envs.model_file.slim import leave_out_meshes, leave_out_surfaces
 from pace_envs.model_file.urdf import UrdfFacts, read_urdf
-from pace_envs.motor_coordinates import add_motors
 from pace_envs.mujoco_warnings import keep_quiet
 
 MODEL_SUFFIXES = (".xml", ".urdf", ".mjcf")
@@ -109,13 +108,14 @@ def compile_model(spec: mujoco.MjSpec, path: str | Path, notes: Sequence[str] = 
 
 
 def _write_urdf_facts(spec: mujoco.MjSpec, facts: UrdfFacts) -> None:
-    """Give the model what MuJoCo's reader of URDF leaves out: mimic joints, and no mass where none is stated."""
+    """Give the model what MuJoCo's reader of URDF leaves out: stiff mimic joints, and no mass where none is stated."""
+    for equality in list(spec.equalities):  # MuJoCo's own of mimic joints: twice the rows, and softer
+        spec.delete(equality)
     for mimic in facts.mimics:
         equality = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1=mimic.joint, name2=mimic.leader)
         equality.data = [mimic.offset, mimic.multiplier, *[0.0] * (len(equality.data) - 2)]
         equality.objtype = mujoco.mjtObj.mjOBJ_JOINT
         equality.solref, equality.solimp = [0.005, 1.0], [0.95, 0.99, 0.001, 0.5, 2.0]
-    add_motors(spec, facts.motors, facts.name)
     for body in spec.bodies:
         if not body.explicitinertial:
             for geom in body.geoms:

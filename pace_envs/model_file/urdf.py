@@ -62,7 +62,8 @@ class UrdfFacts:
     driven: tuple[str, ...]
     """Joints that have a transmission or a ros2_control command; empty where the file names none."""
     motors: Mapping[str, Mapping[str, float]]
-    """Actuators of transmissions that move two joints together, {actuator: {joint: ratio}}, behind their own gears."""
+    """Actuators of transmissions that move two joints together, {actuator: {joint: ratio}}, behind their own gears.
+    The drives are those of the joints, unless a log has the actuators' columns."""
     command: Mapping[str, str]
     """Their command interface, such as ``"velocity"``, where the file names it."""
     notes: tuple[str, ...]
@@ -345,7 +346,8 @@ def _motors(root: ElementTree.Element, path: Path) -> tuple[dict[str, dict[str, 
     notes = []
     if rows:
         notes.append(
-            f"motors of two joints: {listed(list(rows))}: their positions and torques are those behind their gears"
+            f"{listed(list(dict.fromkeys(j for row in rows.values() for j in row)))}: coupled by a transmission. "
+            f"Drives are the joints', or those of {listed(list(rows))} where a log has these columns"
         )
     if left_out:
         notes.append(

@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from pace_actuators.files import refuse_taken
@@ -44,7 +45,7 @@ def main() -> None:
         print(f"{path}: is a recording already, of {', '.join(found[0].joint_names) or 'joints without names'}.")
         parts = [(recording, columns) for recording in found]
     else:
-        robot = _robot(args.task)
+        robot = _robot(args.task, args.log, args.columns)
         each = reader.understood(str(path), robot)
         for line in reader.lines():
             print(line)
@@ -70,14 +71,14 @@ def main() -> None:
         print(f"recording: {target} ({recording.num_samples} samples, {recording.duration:.4g} s)")
 
 
-def _robot(task: str | None) -> Robot:
+def _robot(task: str | None, files: Sequence[str], columns: str | None) -> Robot:
     """What a task says of the robot's joints."""
     if task is None:
         return Robot()
     from pace_envs import ManagerBasedRLEnv, load_env_cfg
-    from pace_optim.problem.recordings import known_robot
+    from pace_optim.problem.recordings import known_robot, motors_of_logs
 
-    cfg = load_env_cfg(task)
+    cfg = load_env_cfg(task, None, motors_of_logs(task, files, columns))
     cfg.scene.num_envs = 1
     env = ManagerBasedRLEnv(cfg)  # type: ignore[arg-type]
     known = known_robot(env)

@@ -54,7 +54,11 @@ class LeastSquaresCfg:
 
     near_enough: float = 2e-3
     """A descent by derivatives of a longer physics step ends when an iteration lowers the score by less than this part
-    of it: the look for the error bars takes the rest. A rough simulation goes on with derivatives at the fit's step."""
+    of it: the look for the error bars takes the rest. A rough simulation goes on with derivatives at the fit's step.
+    Where the score is k² times that of the noise, k² times as much, and derivatives of any step."""
+
+    loosest_enough: float = 2e-3
+    """The largest such part."""
 
     target_score: float = 1e-16
     """Stop below this score [rad²]."""
@@ -70,8 +74,16 @@ class LeastSquaresCfg:
 
     def tolerance(self, score: float) -> float:
         """The part of a score that may be left to gain."""
+        return self._grown(self.score_tolerance, score, self.loosest_tolerance)
+
+    def enough(self, score: float) -> float:
+        """The part of a score that an iteration by derivatives of a longer step must gain."""
+        return self._grown(self.near_enough, score, self.loosest_enough)
+
+    def _grown(self, part: float, score: float, most: float) -> float:
+        """A part that grows as the score stands above the noise."""
         above = score / self.noise_score if self.noise_score > 0 else 1.0
-        return self.score_tolerance * max(1.0, min(above, self.loosest_tolerance / max(self.score_tolerance, 1e-300)))
+        return max(part, min(part * above, most))
 
 
 @dataclass(kw_only=True)
@@ -228,8 +240,10 @@ def _iterate(
             break
     gained = descent.scores[-2] - descent.scores[-1]
     longer = jacobian is not None and evaluator.looks_coarser and not descent.own_step
-    beside = longer and gained <= cfg.near_enough * descent.score
-    if beside and descent.noise >= ROUGH * descent.score**0.5 and descent.iteration < cfg.max_iteration:
+    enough = cfg.enough(descent.score)
+    far = enough > cfg.near_enough
+    beside = (longer or far) and gained <= enough * descent.score
+    if beside and not far and descent.noise >= ROUGH * descent.score**0.5 and descent.iteration < cfg.max_iteration:
         descent.own_step, descent.damping = True, FIRST_DAMPING
         descent.gradient, descent.refused = None, 0
         return

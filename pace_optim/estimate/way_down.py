@@ -4,15 +4,16 @@
    has fewer valleys.
 2. Where that ends above the noise, and the rate of the drives' loops is assumed, descend with others. The way goes on
    with one that explains more.
-3. Where that ends far above the noise, search the pieces around the best end by CMA-ES, one strategy for each kinematic
-   tree. Armatures, frictions and the like are searched by magnitude. The search may simulate a stated multiple of what
-   the descents took. Descend again from its best.
+3. Where that ends far above the noise, and above the error of the torques that no parameter makes, search the
+   pieces around the best end by CMA-ES, one strategy for each kinematic tree. Armatures, frictions and the like are
+   searched by magnitude. The search may simulate a stated multiple of what the descents took. Descend again from its
+   best.
 4. Descend on the whole recordings from the end that is best there.
 
 Residuals are those of the fit's own physics step. Derivatives, and the search, take the longest stable one.
 
-A descent stops when what is left to gain is small against what is missing (``LeastSquaresCfg.tolerance``): where
-physics is missing, the fit ends early.
+A descent stops when what is left to gain is small against what is missing (``LeastSquaresCfg.tolerance`` and
+``enough``): where physics is missing, the fit ends early.
 """
 
 from __future__ import annotations
@@ -44,11 +45,14 @@ class WayDownCfg:
     )
     """Descents on pieces."""
 
-    on_whole: LeastSquaresCfg = field(default_factory=LeastSquaresCfg)
+    on_whole: LeastSquaresCfg = field(default_factory=lambda: LeastSquaresCfg(loosest_enough=3e-2))
     """Descents on the whole recordings."""
 
     far: float = 3.0
     """Times the noise above which the end of a descent on pieces may be a wrong valley."""
+
+    more: float = 1.5
+    """Times the error of missing physics above which it may be one too."""
 
     search_budget: float = 2.0
     """Simulations of the search, in multiples of what the descents on pieces took."""
@@ -81,6 +85,8 @@ class WayDown:
         self.pieces = pieces or evaluator
         self.colouring = colouring
         self.noise_score = noise_score
+        self.missing_score = 0.0
+        """Score that missing physics leaves by itself [rad²]; 0: unknown."""
         self.descents: list[Descent] = []
         """All so far, in the order in which they began."""
         self.stages = f"{name}{PIECES}", f"{name}{WHOLE}"
@@ -110,6 +116,7 @@ class WayDown:
             starts.append(found)
             best = self.begin(starts)
         if (way := elsewhere(best)) is not None:
+            way.missing_score = self.missing_score
             return way.run([best.x], search)
         if search is not None and self.is_far(best.score):
             spent = sum(d.simulations for d in self._of(pieces)[: len(starts)])
@@ -125,8 +132,9 @@ class WayDown:
         return self._descend(self.stages[-1], [], cfg)
 
     def is_far(self, score: float) -> bool:
-        """Whether a score is above the noise by more than what a wrong valley may leave."""
-        return score > self.cfg.far**2 * self.noise_score and score > self.cfg.on_pieces.target_score
+        """Whether a score is above the noise and what missing physics leaves by more than a wrong valley may add."""
+        explained = max(self.cfg.far**2 * self.noise_score, self.cfg.more**2 * self.missing_score)
+        return score > explained and score > self.cfg.on_pieces.target_score
 
     def _of(self, stage: str) -> list[Descent]:
         """A stage's descents so far."""

@@ -34,6 +34,12 @@ from pace_optim.problem.problem import Problem
 _FOUND = ("armature", "viscous_friction", "friction")
 _UNEXPLAINED = 0.5
 """Part of a torque's variance without which a joint keeps its start."""
+_BALANCES = 0.1
+"""Part of a torque, in its standard deviation, that may be left by smoothing and noise alone."""
+_WEAKEST = 0.2
+"""Part of its stiffness that a position loop has left, at least, against the slope of gravity."""
+_SHIFT = 1e-2
+"""Of a position, to see that slope [rad]."""
 _PRIOR = 1e-3
 """Weight of the prior of links against the whole torque: it holds what the motion does not show."""
 _POINTS = np.array(
@@ -44,8 +50,13 @@ _UPPER = np.triu_indices(4)
 """Its ten entries."""
 
 
-def balanced_start(problem: Problem) -> torch.Tensor:
-    """The start of the parameters, normalised (size,), with what the training recordings give in its place."""
+def balanced_start(problem: Problem) -> tuple[torch.Tensor, float]:
+    """Where a fit begins, and what no parameter can take away.
+
+    Returns:
+        The start of the parameters, normalised (size,), with what the training recordings give in its place; the score
+        that missing physics leaves [rad²]: see :func:`_left_over`.
+    """
     views, space = views_of(problem), problem.space
     trained, links = [views[r] for r in problem.dataset.trained()], problem.env_cfg.sim2real.links
     found = _links(trained, links) if links else {}
@@ -56,11 +67,12 @@ def balanced_start(problem: Problem) -> torch.Tensor:
     counts = [moving(view, links) for view, links in seen]
     joints = _judged(counts)
     values = {f"{name}/{link}": value for link, own in found.items() for name, value in own.items()}
-    best = np.inf
+    best, late_by = np.inf, 0
     for delay in range(views[0].most_delay + 1) if joints else ():
         solved = [_solved(*_balance(seen, counts, j, delay), 0.5 * problem.control_dt) for j in joints]
         if (left := sum(part for _, part in solved)) >= best:
             continue
+        late_by = delay
         best, late = left, float(np.median([numbers[-1] for numbers, _ in solved]))
         of_joints = {f"delay/{GLOBAL}": delay + late / problem.control_dt}
         for j, (numbers, part) in zip(joints, solved, strict=True):
@@ -73,7 +85,43 @@ def balanced_start(problem: Problem) -> torch.Tensor:
     physical = space.to_physical(space.start)
     for i, label in enumerate(space.labels):
         physical[i] = values.get(label, float(physical[i]))
-    return space.to_normalised(physical).clamp(-1.0, 1.0)
+    start = space.to_normalised(physical).clamp(-1.0, 1.0)
+    return start, _left_over(seen, counts, joints, late_by, 0.5 * problem.control_dt)
+
+
+def _left_over(
+    seen: Sequence[tuple[View, Links]], counts: Sequence[np.ndarray], joints: Sequence[int], delay: int, half: float
+) -> float:
+    """Score that is left with the torques that no parameter of the base model makes [rad²].
+
+    A position loop gives way by e = τ / (kp + g') to a torque τ that is slow against it, with g' the slope of what the
+    links take. Encoder biases take the place of the constant: they change the torques of links alone. Joints whose
+    torques balance count nothing, nor do those without a position loop.
+    """
+    result, slopes = 0.0, [_slopes(*each) for each in seen]
+    most = seen[0][0].most_bias
+    for j in joints:
+        loops = [view.stiffness[j] for view, _ in seen]
+        if not min(loops) > 0:
+            continue
+        table, torque = _balance(seen, counts, j, delay)
+        biases = np.concatenate([each[count[:, j], j] for each, count in zip(slopes, counts, strict=True)])
+        table = np.column_stack([table[:, :3], table[:, 4], biases])
+        lower, upper = np.array([0.0, 0.0, 0.0, -half, *-most]), np.array([np.inf, np.inf, np.inf, half, *most])
+        values, left = bounded_least_squares(table, torque, lower, upper)
+        if left <= _BALANCES**2 * np.square(torque - torque.mean()).sum():
+            continue
+        holds = [max(kp + each[:, j, j].mean(), _WEAKEST * kp) for kp, each in zip(loops, slopes, strict=True)]
+        missing = (torque - table @ values) / np.repeat(holds, [count[:, j].sum() for count in counts])
+        result += float(np.square(missing).mean())
+    return result
+
+
+def _slopes(view: View, links: Links) -> np.ndarray:
+    """How the torques of the links change with the positions, (N, n, n) [N m/rad]."""
+    shifts = _SHIFT * np.eye(len(view.joints))
+    moved = [Links.of(replace(view, position=view.position + shift)).torque for shift in shifts]
+    return np.stack([(each - links.torque) / _SHIFT for each in moved], axis=-1)
 
 
 def _judged(counts: Sequence[np.ndarray]) -> list[int]:

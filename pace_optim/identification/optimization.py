@@ -402,7 +402,10 @@ class Optimization:
 
     def _first(self) -> torch.Tensor:
         """What is nearer on pieces: the prior's start, or the one that the balance of torques gives."""
-        starts = torch.stack([self.problem.space.start, balanced_start(self.problem)])
+        balanced, left_over = balanced_start(self.problem)
+        if not self.problem.effects and self.problem.dataset.torques is None:  # which the balance does not have
+            self.way.missing_score = left_over
+        starts = torch.stack([self.problem.space.start, balanced])
         with self._found_again(self.way.pieces):
             scores = self.way.pieces.residuals(self.problem.space.to_physical(starts)).score
         return starts[int(scores.nan_to_num(torch.inf).argmin())]

@@ -39,7 +39,7 @@ def load_for_fit(settings: FitSettings, env_cfg: Any = None, tell: Callable[[str
     both = {Path(name).resolve() for name in settings.data} & {Path(name).resolve() for name in settings.validation}
     if both:
         raise ValueError(f"{both.pop()} is named by --data and --validation: what is trained on validates nothing.")
-    problem = checked(problem_of(settings, env_cfg, tell), settings.trust_log)
+    problem = checked(problem_of(settings, env_cfg, tell), settings.trust_log, tell)
     if problem.dataset.num_recordings * 4 > settings.num_envs and settings.only_searches:
         raise ValueError(
             f"--num_envs {settings.num_envs} is too few for {problem.dataset.num_recordings} recordings: expected at "

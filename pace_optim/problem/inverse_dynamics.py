@@ -5,11 +5,13 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import mujoco
 import numpy as np
 
 from pace_envs import ManagerBasedEnv
+from pace_envs.closed_loops import ClosedLoops
 from pace_envs.motor_coordinates import DrivenJoints
 from pace_envs.moving_frame import FrameState, bias_in_frame
 
@@ -19,7 +21,11 @@ _MODEL_FIELDS = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_p
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LinkMotion:
-    """A motion of K instants of some joints of a model, whose base may still move in any way."""
+    """A motion of K instants of some joints of a model, whose base may still move in any way.
+
+    Passive joints stand where the model's equality constraints hold, and move with the driven ones: v = T v_d. The
+    constraints carry what passive links need to the driven joints: τ_d = T' τ, with τ of the links alone.
+    """
 
     model: mujoco.MjModel
     driven: DrivenJoints
@@ -27,7 +33,12 @@ class LinkMotion:
     """Torques of all degrees of freedom on a base that rests, (K, nv) [N m]."""
     bias: np.ndarray
     """Their part that the base changes, (K, nv) [N m]."""
-    state: FrameState
+    posture: np.ndarray
+    """(K, nq)."""
+    velocity: np.ndarray
+    """(K, nv)."""
+    following: np.ndarray
+    """T of the driven joints, (K, nv, n), or (1, nv, n) where it is the same in all postures."""
 
     @classmethod
     def of(
@@ -46,18 +57,46 @@ class LinkMotion:
             speed: (K, n) [rad/s].
             acceleration: (K, n) [rad/s²].
         """
-        data, driven = mujoco.MjData(model), DrivenJoints.of_model(model, joints)
+        driven = DrivenJoints.of_model(model, joints)
         qpos = [model.joint(name).qposadr[0] for name in driven.joints]
         dof = [model.joint(name).dofadr[0] for name in driven.joints]
         position, speed, acceleration = (driven.to_joints(each) for each in (position, speed, acceleration))
+        loops = ClosedLoops.of_model(model, dof)
+        links = copy.copy(model)
+        links.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT  # a violated one would act as a spring
+        posture = np.repeat(links.qpos0[None], len(position), 0)
+        posture[:, qpos] = position
+        velocity, change = np.zeros((2, len(position), model.nv))
+        velocity[:, dof], change[:, dof] = speed, acceleration
+        following = np.eye(model.nv)[None][..., dof]
+        if loops is not None:
+            posture, velocity, change, following = loops.along(posture, velocity, change, dof)
+        data = mujoco.MjData(links)
         torque, bias = np.empty((2, len(position), model.nv))
-        state = FrameState.empty(model, len(position))
         for k in range(len(position)):
-            data.qpos[qpos], data.qvel[dof], data.qacc[dof] = position[k], speed[k], acceleration[k]
-            mujoco.mj_inverse(model, data)
+            data.qpos[:], data.qvel[:], data.qacc[:] = posture[k], velocity[k], change[k]
+            mujoco.mj_inverse(links, data)
             torque[k], bias[k] = data.qfrc_inverse, data.qfrc_bias
+        return cls(
+            model=links,
+            driven=driven,
+            at_rest=torque,
+            bias=bias,
+            posture=posture,
+            velocity=velocity,
+            following=following,
+        )
+
+    @cached_property
+    def _state(self) -> FrameState:
+        """What a base that moves acts on."""
+        state, data = FrameState.empty(self.model, len(self.posture)), mujoco.MjData(self.model)
+        for k in range(len(self.posture)):
+            data.qpos[:], data.qvel[:] = self.posture[k], self.velocity[k]
+            mujoco.mj_fwdPosition(self.model, data)
+            mujoco.mj_fwdVelocity(self.model, data)
             state.keep(k, data)
-        return cls(model=model, driven=driven, at_rest=torque, bias=bias, state=state)
+        return state
 
     def torque(self, frame: np.ndarray | None = None, point: np.ndarray | None = None) -> np.ndarray:
         """Torques of the joints, (K, n) [N m].
@@ -68,9 +107,8 @@ class LinkMotion:
         """
         torque = self.at_rest
         if frame is not None and point is not None:
-            torque = torque - self.bias + bias_in_frame(self.model, self.state, frame, point)
-        dof = [self.model.joint(name).dofadr[0] for name in self.driven.joints]
-        return self.driven.efforts_of_motors(torque[:, dof])
+            torque = torque - self.bias + bias_in_frame(self.model, self._state, frame, point)
+        return self.driven.efforts_of_motors((torque[:, None] @ self.following)[:, 0])
 
 
 def frame_motion(frame: np.ndarray, dt: float) -> np.ndarray:

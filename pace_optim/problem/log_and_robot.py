@@ -83,14 +83,14 @@ def _half(recording: Recording) -> int:
 
 
 def asked_torque(env: ManagerBasedEnv, recording: Recording) -> np.ndarray:
-    """What the drives were asked for, within the configured limits, (T, n) [N m]."""
+    """What the drives were asked for, within the limits in force, (T, n) [N m]."""
     speed = np.gradient(_smooth(recording.dof_pos, _half(recording)), recording.time, axis=0)
     kp, kd = gains(env, recording)
     steps = recording.sample_steps
     asked_speed = 0.0 if recording.command_vel is None else recording.command_vel[steps]
     torque = kp * (recording.sampled_command - recording.dof_pos) + kd * (asked_speed - speed)
     torque += 0.0 if recording.command_effort is None else recording.command_effort[steps]
-    limit = of_joints(env, "effort_limit")
+    limit = of_joints(env, "effort_limit") if recording.drive.effort_limit is None else recording.drive.effort_limit
     return np.clip(torque, -limit, limit)
 
 

@@ -46,11 +46,10 @@ from pace_optim.problem.log_and_robot import (
 )
 from pace_optim.problem.moving_base import BasePath, base_path, on_moving_base
 from pace_optim.problem.parameter_space import ParameterSpace
-from pace_optim.problem.recordings import Logs, conform_all, read_logs, tell_on_stderr
+from pace_optim.problem.recordings import Logs, conform_all, motors_of_logs, read_logs, tell_on_stderr
 from pace_optim.problem.unknown_facts import GAINS, LIMITS, lift_limits, refined_limits, with_unknown
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import Dataset, Torques, make_dataset
-from pace_optim.recording.files import stated_couplings
 from pace_optim.recording.parts import affordable
 from pace_optim.recording.torque import MeasuredDrives, TorqueChannel, read_drives, torque_channel
 from pace_optim.recording.windows import Windows
@@ -469,7 +468,7 @@ def load_problem(
         delay_mode=delay_mode,
         physics_dt=physics_dt,
         drive_dt=drive_dt,
-        motors=stated_couplings([*data, *validation]),
+        motors=motors_of_logs(task, [*data, *validation], columns),
     )
     env = stated.make_env()
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,14 +15,15 @@ import numpy as np
 from pace_actuators import match_names
 from pace_actuators.joint_units import units_for
 from pace_actuators.text import listed
+from pace_envs.model_file import is_model_file, read_model_file
 from pace_envs.motor_coordinates import joint_ranges
 from pace_optim.problem.drive_steps import of_joints
 from pace_optim.recording import Recording, conform_recording
 from pace_optim.recording.commands import command_interval
 from pace_optim.recording.conform import of_motors, with_columns
-from pace_optim.recording.files import unused_facts
+from pace_optim.recording.files import stated_couplings, unused_facts
 from pace_optim.recording.gaps import split_at_gaps
-from pace_optim.recording.logs import LogReader, Robot, paired_files, read_map, with_rate
+from pace_optim.recording.logs import LogReader, Robot, column_names, paired_files, read_map, with_rate
 
 if TYPE_CHECKING:
     from pace_envs import ManagerBasedEnv
@@ -127,6 +129,29 @@ def read_logs(
         for group in read_groups
     )
     return Logs(groups=narrowed, joints=kept, held=held, note=note)
+
+
+def motors_of_logs(
+    task: str, files: Sequence[str | Path], columns: str | Path | None = None
+) -> Mapping[str, Mapping[str, float]]:
+    """Motors that move several joints: those that files state, or those of a URDF's transmissions that files name.
+
+    Args:
+        task: As the command line has it.
+        files: Recordings and logs.
+        columns: Column map of the logs among them.
+    """
+    if (stated := stated_couplings(files)) or not is_model_file(task):
+        return stated
+    urdf = read_model_file(task).urdf
+    if urdf is None or not urdf.motors:
+        return {}
+    chosen = None if columns is None else read_map(Path(columns))
+    for file in files:
+        names = " ".join(column_names(Path(file), chosen))
+        if all(re.search(rf"(?<![^\W_]){re.escape(motor)}(?![^\W_])", names) for motor in urdf.motors):
+            return urdf.motors
+    return {}
 
 
 def conform_all(

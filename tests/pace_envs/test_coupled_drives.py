@@ -14,6 +14,7 @@ from pace_actuators import PaceDCMotorCfg
 from pace_actuators.effects.fading_friction import solver_parameters, step_of_constraint
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.from_model import cfg_from_model
+from pace_envs.model_file import read_model_file
 from pace_envs.motor_coordinates import DrivenJoints
 from pace_envs.robot_spec import load_robot_spec
 from pace_envs.task_source import EnvironmentRecord
@@ -319,7 +320,8 @@ def test_a_configuration_and_a_urdf_state_motors_too(tmp_path):
     """Differential transmissions of ROS; what a file gives the joints for drives is left to the motors."""
     urdf = tmp_path / "wrist.urdf"
     urdf.write_text(URDF)
-    cfg = cfg_from_model(urdf)
+    motors = read_model_file(urdf).urdf.motors
+    cfg = cfg_from_model(urdf, motors=motors)
     assert cfg.sim2real.joint_order == ("a", "b_motor")
     env = ManagerBasedRLEnv(cfg)
     assert env.scene["robot"].driven.row_of("b_motor") == {"pitch": 1.5, "b": -2.0}
@@ -335,6 +337,30 @@ def test_a_configuration_and_a_urdf_state_motors_too(tmp_path):
     model = load_robot_spec(robot).compile()
     assert not model.dof_damping.any()
     assert np.allclose(DrivenJoints.of_model(model, robot.joint_order).matrix, [[1.5, -1.0], [1.5, 1.0]][::1])
+
+
+def test_a_urdf_s_drives_are_the_joints_unless_a_log_names_the_motors(tmp_path):
+    """A log is in the coordinates that its columns name, and so are the gains and limits beside it."""
+    urdf = tmp_path / "wrist.urdf"
+    urdf.write_text(URDF)
+    time = np.arange(0, 3, 0.005)
+    swing = 0.3 * np.sin(2 * np.pi * 0.7 * time)[:, None] * [1.0, 0.8]
+
+    def posed(names, gains):
+        log = tmp_path / f"{names[0]}.csv"
+        columns = [f"{name}_{kind}" for kind in ("pos", "cmd") for name in names]
+        table = np.column_stack([time, swing, swing])
+        np.savetxt(log, table, delimiter=",", header=",".join(["time", *columns]), comments="")
+        log.with_suffix(".json").write_text(json.dumps({"stiffness": gains, "damping": 0.2}))
+        return load_problem(str(urdf), data=[log], drive_dt=1e-3, tell=lambda _: None)
+
+    problem = posed(("pitch", "b"), {"pitch": 12.0, "b": 7.0})
+    assert problem.joint_names == ("pitch", "b")
+    assert problem.dataset.recordings[0].drive.stiffness.tolist() == [12.0, 7.0]
+    assert problem.env_cfg.scene.robot.actuators["drives"].effort_limit == [18.0, 12.0]  # of the joints
+    motors = posed(("a", "b_motor"), {"a": 12.0, "b_motor": 7.0})
+    assert motors.joint_names == ("a", "b_motor")
+    assert motors.make_env(1).scene["robot"].driven.row_of("a") == {"pitch": 1.5, "b": 2.0}
 
 
 URDF = """<robot name="wrist"><link name="base"/>

@@ -323,7 +323,7 @@ def test_a_fit_of_a_tool_begins_near_it(tmp_path):
     tool = Load(added_mass={"tool": 0.5}, added_mass_at={"tool": (0.03, 0.0, -0.08)})
     recording = dataclasses.replace(recorded(tmp_path, {}, tool, noise=1e-4), load=Load())
     space = (problem := make_problem(recording, cfg=arm_cfg(tmp_path, ["tool@load"]))).space
-    start = space.to_dict(space.to_physical(balanced_start(problem)))
+    start = space.to_dict(space.to_physical(balanced_start(problem)[0]))
     assert start["link_load_mass"]["tool"] == pytest.approx(0.5, rel=0.1)
     assert start["link_load_x"]["tool"] == pytest.approx(0.03, abs=0.01)
     assert start["link_load_z"]["tool"] == pytest.approx(-0.08, abs=0.01)
@@ -334,7 +334,7 @@ def test_a_known_load_stays_where_a_fit_of_its_link_begins(tmp_path):
     true = {"fore": reference("fore").inertia({"link_mass": 0.92})}
     known = Load(added_mass={"fore": 0.6}, added_mass_at={"fore": (0.0, 0.0, -0.25)})
     problem = make_problem(recorded(tmp_path, true, known, noise=1e-4), cfg=arm_cfg(tmp_path, ["fore@mass"]))
-    start = problem.space.to_dict(problem.space.to_physical(balanced_start(problem)))
+    start = problem.space.to_dict(problem.space.to_physical(balanced_start(problem)[0]))
     assert start["link_mass"]["fore"] == pytest.approx(0.92, rel=0.1)
     assert start["armature"]["elbow"] == pytest.approx(0.02, rel=0.5)
     assert start["friction"]["elbow"] == pytest.approx(0.1, rel=0.5)
@@ -346,7 +346,7 @@ def test_a_fit_of_two_wrong_links_begins_near_them(tmp_path):
         "fore": reference("fore").inertia({"link_com_x": 0.05}),
     }
     problem = make_problem(recorded(tmp_path, true, noise=1e-4), cfg=arm_cfg(tmp_path, ["upper@mass", "fore@com"]))
-    start = problem.space.to_dict(problem.space.to_physical(balanced_start(problem)))
+    start = problem.space.to_dict(problem.space.to_physical(balanced_start(problem)[0]))
     assert start["link_mass"]["upper"] == pytest.approx(1.8, rel=0.1)
     assert start["link_com_x"]["fore"] == pytest.approx(0.05, abs=0.01)
 

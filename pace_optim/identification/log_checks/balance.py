@@ -155,7 +155,6 @@ def views_of(problem: Problem) -> list[View]:
                 own = getattr(actuator, name)
                 values[actuator.joint_indices] = own[min(r, len(own) - 1)].cpu().numpy()
         model = model_of(env, r)
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT  # only its links
         command = np.asarray(recording.command)
         zero = np.zeros_like(command)
         on = recording.command_torque_enable

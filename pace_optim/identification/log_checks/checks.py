@@ -19,6 +19,7 @@ from pace_actuators.text import listed
 from pace_optim.identification.log_checks.balance import Balance, Links, View, balances, views_of, without
 from pace_optim.identification.log_checks.imu import late, other_axes, other_units, stuck_contacts
 from pace_optim.problem.problem import Problem
+from pace_optim.problem.recordings import tell_nobody
 
 _DOUBTED = 0.04
 """Misfit from which a joint is looked at."""
@@ -347,15 +348,30 @@ def lifted_limits(evidence: Evidence) -> Iterator[Change]:
     for j in _of_known_gains(evidence):
         given, asked = view.given(j), view.asked(j)
         if np.mean(np.abs(given - asked) > 1e-6 * np.abs(asked)) > _SHARE:
-            limits = {name: getattr(view, name).copy() for name in ("effort_limit", "saturation_effort")}
-            for values in limits.values():
-                values[j] = np.inf
             yield Change(
                 joints=(j,),
-                view=replace(view, **limits),
-                text="{joints} gives the torque that is asked for, also where its stated limits would cut it. Correct "
-                "effort_limit, saturation_effort and velocity_limit.",
+                view=_without_limits(view, j),
+                text=f"{{joints}} gives what its gains ask for, up to {np.abs(asked).max():.3g} N m, although "
+                f"{_limits_of(view, j)}. State the real effort_limit beside the log (NAME.json) or in its column map: "
+                "it replaces the model's and widens the bounds.",
             )
+
+
+def _without_limits(view: View, j: int) -> View:
+    """A recording whose drive of one joint gives what is asked for."""
+    limits = {name: getattr(view, name).copy() for name in ("effort_limit", "saturation_effort")}
+    for values in limits.values():
+        values[j] = np.inf
+    return replace(view, **limits)
+
+
+def _limits_of(view: View, j: int) -> str:
+    """The limits of a joint's drive, for a sentence."""
+    limit, stall, fastest = view.effort_limit[j], view.saturation_effort[j], view.velocity_limit[j]
+    told = [f"its effort_limit is {limit:.3g} N m"] if np.isfinite(limit) else []
+    if np.isfinite(stall) and np.isfinite(fastest):
+        told.append(f"its torque ends at a saturation_effort of {stall:.3g} N m and {fastest:.3g} rad/s")
+    return listed(told)
 
 
 def _of_known_gains(evidence: Evidence) -> list[int]:
@@ -464,18 +480,18 @@ _CONTACTS = Check(name="contacts", changes=lambda _: iter(()), stops=False)
 
 
 def _least(evidence: Evidence, changed: Callable[[float], View], values: np.ndarray, joints: list[int]) -> float:
-    """The value of which the balance is best; refined between its neighbours."""
+    """The value of which the balance is best at few instants; refined between its neighbours."""
     coarse = evidence.coarse()
 
-    def misfit(value: float, reference: Evidence) -> float:
-        view = replace(changed(float(np.exp(value))), coarse=reference.view.coarse)
-        links = reference.links if reference.is_same_motion(view) else Links.of(view, reference.links)
+    def misfit(value: float) -> float:
+        view = replace(changed(float(np.exp(value))), coarse=True)
+        links = coarse.links if coarse.is_same_motion(view) else Links.of(view, coarse.links)
         return float(sum(np.log(each.misfit) for each in balances(view, links, joints).values()))
 
     values = np.log(np.sort(values))
-    best = int(np.argmin([misfit(value, coarse) for value in values]))
+    best = int(np.argmin([misfit(value) for value in values]))
     bounds = values[max(best - 1, 0)], values[min(best + 1, len(values) - 1)]
-    fine = minimize_scalar(misfit, bounds=bounds, args=(evidence,), method="bounded", options={"maxiter": 12})
+    fine = minimize_scalar(misfit, bounds=bounds, method="bounded", options={"maxiter": 12})
     return float(np.exp(fine.x))
 
 
@@ -582,6 +598,8 @@ SIGHTS = (
     Check(name="spikes", changes=spikes, stops=False),
 )
 """What is seen in a log by itself."""
+_LIFTED = Check(name="lifted limits", changes=lifted_limits, stops=False)
+"""Named by itself: a motion that follows what is asked refutes a limit, also where something else is missing."""
 CHECKS = (
     Check(name="IMU units", changes=imu_units, stops=True),
     Check(name="IMU axes", changes=imu_axes, stops=True),
@@ -589,7 +607,6 @@ CHECKS = (
     Check(name="swapped joints", changes=swapped, stops=True),
     Check(name="wrapped targets", changes=wrapped_targets, stops=True),
     Check(name="clipped targets", changes=clipped_targets, stops=True),
-    Check(name="lifted limits", changes=lifted_limits, stops=False),
     Check(name="gravity", changes=turned_gravity, stops=False),
     Check(name="torque limit", changes=torque_limit, stops=False),
     Check(name="scale", changes=scaled, stops=True),
@@ -604,6 +621,12 @@ def explained(view: View) -> list[Finding]:
             findings.append(_finding(check, change))
             view = replace(view, position=change.view.position, used=view.used & change.view.used)
     before = evidence = Evidence.of(view)
+    for change in list(lifted_limits(evidence)):
+        (j,) = change.joints
+        after = Evidence.of(_without_limits(evidence.view, j), evidence, change.joints)
+        if _gain(evidence, after, change) > 0:
+            findings.append(_finding(_LIFTED, change, evidence.balance[j].misfit, after.balance[j].misfit))
+            evidence = after
     named: list[tuple[Check, Change]] = []
     for _ in range(2 * len(view.joints) + 1):
         step = _best_change(evidence)
@@ -686,16 +709,19 @@ def check_log(problem: Problem) -> list[Finding]:
     ]
 
 
-def checked(problem: Problem, trust: bool = False) -> Problem:
+def checked(problem: Problem, trust: bool = False, tell: Callable[[str], None] = tell_nobody) -> Problem:
     """The problem with what is wrong with its log among its contradictions, and with IMUs that are late in time.
 
     Args:
         trust: Whether a log that no fit can be right of is only warned of.
+        tell: Gets what is wrong before the fit begins.
     """
     found = check_log(problem)
     if (wrong := [each.sentence for each in found if each.stops]) and not trust:
         raise ValueError(f"{' '.join(wrong)} If the log is right as it is, give --trust_log.")
     said = tuple(f"{each.sentence} [W3]" for each in found)
+    for each in said:
+        tell(f"warning: {each}")
     problem = problem.with_imu_delays(_delays_of_whole(problem, found))
     return replace(problem, contradictions=(*problem.contradictions, *said))
 

@@ -169,9 +169,9 @@ class Links:
             for first in range(0, shape[0], _AT_ONCE):
                 at = slice(first, first + _AT_ONCE), r
                 states = LinkStates.of(model, qpos[at], qvel[at], qacc[at], self.following, *motion.course(at))
-                felt.put(at, states.feel(self._direct, own[at]))
+                felt.put(at, states.feel(self._carried, own[at]))
                 for key, change in changes.items():
-                    changed[key].put(at, states.change(change[r], self._direct, own[at]))
+                    changed[key].put(at, states.change(change[r], self._carried, own[at]))
         return felt, changed
 
     def _of_joints(self, motion: Motion) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -192,6 +192,12 @@ class Links:
         turn = self.coordinates
         driven = every if turn is None else turn.of_driven(every, turn.columns).T
         return driven[:, self.columns].numpy()
+
+    @cached_property
+    def _carried(self) -> np.ndarray:
+        """The same with joints that follow by a ratio: drives carry them, (nv, n)."""
+        carrying = None if self.loops is None or self.coordinates is not None else self.loops.carrying
+        return self._direct if carrying is None else carrying.T @ self._direct
 
     def following(self, qpos: np.ndarray) -> np.ndarray:
         """How all speeds follow from the drives' at a posture (nq,), (nv, n)."""

@@ -97,7 +97,7 @@ class LinkStates:
         """Inertia, torque and load of the joints, (B, n) each.
 
         Args:
-            direct: Speeds by those of the driven joints where nothing else follows, (nv, n).
+            direct: Speeds by those of the driven joints and of what follows them by a ratio, (nv, n).
             own: Accelerations of the joints, (B, n).
         """
         missing = np.einsum("kij,kj->ki", self.mass, self.qacc) + self.bias - self.passive

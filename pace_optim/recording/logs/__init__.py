@@ -4,12 +4,13 @@
 """
 
 from .column_map import ColumnMap, read_map, with_rate, write_map
-from .load import LogReader, Robot, is_log, load_recordings, paired_files, understood
+from .load import LogReader, Robot, column_names, is_log, load_recordings, paired_files, understood
 
 __all__ = [
     "ColumnMap",
     "LogReader",
     "Robot",
+    "column_names",
     "is_log",
     "load_recordings",
     "paired_files",

@@ -210,6 +210,18 @@ def is_log(path: Path, columns: ColumnMap | None = None) -> bool:
     return path.suffix.lower() == ".csv" and path.is_file() and not _is_own_csv(path)
 
 
+def column_names(path: Path, columns: ColumnMap | None = None) -> tuple[str, ...]:
+    """The names of a recording's joints, or of a log's columns; none of what cannot be read."""
+    if columns is not None and columns.joints:
+        return tuple(columns.joints)
+    try:
+        if not is_log(path, columns):
+            return load_recording(path).joint_names
+        return tuple(name for log in _logs(path, columns) for name in log.channels)
+    except ValueError:
+        return ()
+
+
 def _parts(path: Path) -> list[Path]:
     """The files that a path joins by `+`; one in the name of a file or folder joins nothing."""
     found, begun = [], ""

@@ -179,6 +179,7 @@ def test_limits_and_dynamics_of_a_urdf_are_read_and_its_meshes_are_not_needed(tm
     assert "foot" in robot.body_names  # a load can be bolted to a fixed link
     knee = float(robot.data.joint_pos[0, 1])
     assert env.sim.qpos[0, 2] == pytest.approx(0.1 - 0.5 * knee)  # the mimic joint starts where it must be
+    assert env.sim.model.neq == 1  # MuJoCo's own reading of mimic joints is not added to ours
     env.close()
 
 

@@ -97,6 +97,22 @@ def test_it_is_searched_only_where_the_pieces_end_above_the_noise(problem, colou
     assert noise or best.score < 1e-14
 
 
+@pytest.mark.parametrize("missing", [0.0, 1.0])
+def test_it_is_not_searched_where_missing_physics_leaves_as_much(problem, colouring, missing):
+    stuck = LeastSquaresCfg(max_iteration=1)
+    staged = way(problem, colouring, noise_score=1e-12, cfg=WayDownCfg(on_pieces=stuck))
+    staged.missing_score = missing
+    searched = []
+    staged.run([torch.full_like(centre(problem), 0.9)], lambda *_: searched.append(0) or [])
+    assert bool(searched) is not bool(missing)
+
+
+def test_an_iteration_must_gain_more_where_the_score_is_far_above_the_noise():
+    cfg = LeastSquaresCfg(noise_score=1e-8, loosest_enough=3e-2)
+    assert [cfg.enough(score) for score in (1e-9, 1e-8, 4e-8, 1e-6)] == pytest.approx([2e-3, 2e-3, 8e-3, 3e-2])
+    assert LeastSquaresCfg(noise_score=1e-8).enough(1e-6) == 2e-3
+
+
 def test_a_way_that_is_resumed_is_the_one_that_was_interrupted(problem, colouring):
     seen = []
     staged = way(problem, colouring, on_iteration=lambda _: seen.append(checkpoint_of(staged.descents)))
