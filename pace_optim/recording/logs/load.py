@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import shlex
+import zipfile
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -26,10 +27,12 @@ from .guess import Robot, as_one, guess_map
 from .log import Channel, Log
 from .rosbag import read_rosbag
 from .tables import SUFFIXES as TABLES
-from .tables import Head, head_of, is_joint_table, read_csv_log, read_parquet_log
+from .tables import Head, head_of, is_joint_table, read_csv_log, read_npz_log, read_parquet_log
 
 BAGS = (".mcap", ".db3", ".bag")
 LOG_SUFFIXES = (*BAGS, ".parquet", *(each for each in TABLES if each not in SUFFIXES))
+_OWN = {"dof_pos", "des_dof_pos"}
+"""One of these is in every recording of this project's own form."""
 _JOIN = "+"
 """Between the files of one log: states.csv+commands.csv."""
 
@@ -207,6 +210,8 @@ def is_log(path: Path, columns: ColumnMap | None = None) -> bool:
         return True
     if path.is_dir() or path.suffix.lower() not in SUFFIXES or len(_parts(path)) > 1:
         return True
+    if path.suffix.lower() == ".npz" and path.is_file():
+        return not _is_own_npz(path)
     return path.suffix.lower() == ".csv" and path.is_file() and not _is_own_csv(path)
 
 
@@ -280,11 +285,21 @@ def _head(path: Path) -> Head:
         return Head(names=(), delimiter=",", first_row=1, notes=())
 
 
+def _is_own_npz(path: Path) -> bool:
+    """Whether arrays are meant to be a recording, as for a CSV; so is what is no archive, which its reader refuses."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = {Path(name).stem for name in archive.namelist()}
+    except (OSError, zipfile.BadZipFile):
+        return True
+    return not names.isdisjoint(_OWN)
+
+
 def _is_own_csv(path: Path) -> bool:
     """Whether a CSV is meant to be a recording: it has the time and joints of one of the series by their names."""
     head = _head(path)
     own = [column.partition("/")[0] for column in head.names if "/" in column]
-    return head.first_row == 1 and (len(head.names) < 2 or not {"dof_pos", "des_dof_pos"}.isdisjoint(own))
+    return head.first_row == 1 and (len(head.names) < 2 or not _OWN.isdisjoint(own))
 
 
 def _logs(path: Path, columns: ColumnMap | None) -> Iterator[Log]:
@@ -316,6 +331,8 @@ def _logs(path: Path, columns: ColumnMap | None) -> Iterator[Log]:
         yield read_rosbag(path)
     elif suffix == ".parquet":
         yield from read_parquet_log(path, columns)
+    elif suffix == ".npz":
+        yield from read_npz_log(path, columns)
     elif suffix in TABLES:
         yield from read_csv_log(path, columns)
     else:

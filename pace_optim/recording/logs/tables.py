@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import itertools
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -17,6 +18,7 @@ from pace_actuators.files import parsed_json
 from pace_actuators.memory import check_memory
 from pace_actuators.text import listed
 from pace_optim.recording.time_base import seconds_of, set_back, unix_unit, unrounded
+from pace_optim.terminal.arrays import read_arrays
 
 from .column_map import ColumnMap
 from .log import Log, cleaned, reader
@@ -161,6 +163,24 @@ def read_csv_log(path: Path, columns: ColumnMap | None) -> list[Log]:
     if table:
         content = {f"{table}:{name}" if name in names else name: values for name, values in content.items()}
     return _logs(path.stem, path, content, columns, table, notes)
+
+
+def read_npz_log(path: Path, columns: ColumnMap | None) -> list[Log]:
+    """Read arrays of any names: (T,) one column, (T, n) one for each name of an array of n texts, else numbered."""
+    arrays = read_arrays(path, "Save arrays with numpy.savez, a row for each sample.")
+    numbers = {key: values for key, values in arrays.items() if values.dtype.kind in "biuf" and values.ndim in (1, 2)}
+    texts = [values.astype(str).tolist() for values in arrays.values() if values.dtype.kind == "U" and values.ndim == 1]
+    rows, _ = max(Counter(map(len, numbers.values())).items(), key=lambda item: item[1], default=(0, 0))
+    content: dict[str, np.ndarray] = {}
+    for key, values in numbers.items():
+        if len(values) == rows and values.ndim == 1:
+            content[key] = values
+        elif len(values) == rows:
+            names = next((own for own in texts if len(own) == values.shape[1]), range(values.shape[1]))
+            content |= {f"{key}/{name}": column for name, column in zip(names, values.T, strict=True)}
+    left = [key for key, values in arrays.items() if values.dtype.kind != "U" and len(np.atleast_1d(values)) != rows]
+    notes = [f"Not used, because they have other rows: {listed(left)}."] if left else []
+    return _logs(path.stem, path, content, columns, notes=notes)
 
 
 def read_parquet_log(path: Path, columns: ColumnMap | None) -> list[Log]:

@@ -48,7 +48,7 @@ _TIMES = {
     "t", "time", "times", "timestamp", "timestamps", "stamp", "stamps", "ts", "clock", "datetime", "date", "sec",
     "secs", "second", "seconds", "msec", "msecs", "millis", "milliseconds", "usec", "usecs", "micros", "microseconds",
     "nsec", "nsecs", "nanosec", "nanosecs", "nanos", "nanoseconds", "elapsed", "millisec", "millisecs", "microsec",
-    "microsecs",
+    "microsecs", "zeit",
 }  # fmt: skip
 _OF_TIMES = {
     "header", "ros", "log", "unix", "epoch", "since", "start", "utc", "from", "relative", "rel", "sim", "wall",
@@ -58,19 +58,19 @@ _OF_TIMES = {
 """Words beside those."""
 _COMMAND = {
     "cmd", "cmds", "command", "commands", "commanded", "des", "desired", "target", "targets", "goal", "ref",
-    "reference", "setpoint", "set", "action", "actions", "sp", "ctrl", "input", "lowcmd",
+    "reference", "setpoint", "set", "action", "actions", "sp", "ctrl", "input", "lowcmd", "soll",
 }  # fmt: skip
 _MEASURED = {
     "meas", "measured", "actual", "act", "present", "current", "feedback", "fb", "obs", "observation", "state",
-    "states", "est", "real", "read", "encoder", "enc", "lowstate", "sensor", "filtered",
+    "states", "est", "real", "read", "encoder", "enc", "lowstate", "sensor", "filtered", "ist",
 }  # fmt: skip
 _NO_QUANTITY = {
     "state", "states", "action", "actions", "cmd", "command", "commands", "commanded", "des", "desired", "target",
     "goal", "ref", "reference", "setpoint", "sp", "set", "actual", "act", "measured", "meas", "present", "feedback",
-    "fb", "encoder", "enc",
+    "fb", "encoder", "enc", "ist", "soll",
 }  # fmt: skip
 """Words for positions in names without a quantity."""
-_POSITION = {"pos", "position", "positions", "q", "angle", "angles", "qpos", "theta", "phi", "angular"}
+_POSITION = {"pos", "position", "positions", "q", "angle", "angles", "qpos", "theta", "phi", "angular", "winkel"}
 _VELOCITY = {"vel", "velocity", "velocities", "dq", "qd", "qvel", "speed", "speeds", "omega", "qdot", "rate"}
 _EFFORT = {
     "effort", "efforts", "torque", "torques", "tau", "trq", "tq", "moment", "ff", "feedforward", "load", "force",
