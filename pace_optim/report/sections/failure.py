@@ -10,7 +10,7 @@ from typing import Any
 from markupsafe import Markup
 
 from pace_actuators.joint_units import JointType, joint_label, units_for
-from pace_actuators.text import position_text, position_unit, short_duration, three_figures
+from pace_actuators.text import percent, position_text, position_unit, short_duration, three_figures
 
 from ..markup import Section, bullets, choice, html, json_script, log_step, table
 from ..run_data import RunData
@@ -85,7 +85,7 @@ def _by_joint(content: dict[str, Any]) -> Markup:
     factor, unit = position_unit([joint["rmse"].get(part) for joint in joints.values() for part in parts], ["hinge"])
     rows = []
     for (name, joint), own in zip(joints.items(), types, strict=True):
-        share = 100 * joint["share_above_floor"]
+        share = joint["share_above_floor"]
         label = joint_label(name, own, types, unit)
         rows.append(
             [
@@ -93,8 +93,9 @@ def _by_joint(content: dict[str, Any]) -> Markup:
                 *(three_figures(factor * joint["rmse"][part]) for part in parts),
                 three_figures(factor * joint["noise_floor"]),
                 html(
-                    '<span class="share"><div><i style="width:{{ share }}%"></i></div>{{ share }} %</span>',
-                    share=f"{share:.0f}",
+                    '<span class="share"><div><i style="width:{{ share }}%"></i></div>{{ text }}</span>',
+                    share=f"{100 * share:.0f}",
+                    text=percent(share),
                 ),
                 joint["sentence"].removeprefix(f"{name}: ").removeprefix(f"{name} "),
             ]

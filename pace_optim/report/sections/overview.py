@@ -12,7 +12,7 @@ from pace_actuators.drive_result import ALL
 from pace_actuators.joint_units import JointType, joint_label, units_for
 from pace_actuators.text import SHOWN, duration, position_text, position_unit, pretty_unit, three_figures
 from pace_optim.run.result import FitResult
-from pace_optim.run.summary import ABOVE_NOISE, next_line
+from pace_optim.run.summary import ABOVE_NOISE, next_lines
 
 from ..markup import Section, bullets, folded, html
 from ..run_data import RunData
@@ -88,8 +88,7 @@ def _verdict(run: RunData) -> str:
 
 def _next(run: RunData) -> str:
     """The command that comes next, where nothing was diagnosed."""
-    compared = bool(run.read_json("comparison.json"))
-    lines = [] if run.read_json("diagnosis.json") else next_line(run.result, run.folder.resolve(), compared=compared)
+    lines = [] if run.read_json("diagnosis.json") else next_lines(run.result, run.folder.resolve())
     return "".join(lines).removeprefix("next: ")
 
 

@@ -57,15 +57,21 @@ def test_the_run_with_what_was_missing_is_not_told_to_add_it(tmp_path):
 
 
 CURVE = "torque_over_position@hip"
-MORE = {"joints": {**make_diagnosis()["joints"], "hip": {**make_diagnosis()["joints"]["hip"], "floor": 1e-5}}}
+MORE = {"more": {"hip": "0.4 mrad, 40 floors"}}
 """The hip ends far from its floor."""
+COVERED = {
+    "joints": make_diagnosis()["joints"] | {"hip": make_diagnosis()["joints"]["hip"] | {"effects": [CURVE[:20]]}}
+}
+COVERED |= {"free_form": [CURVE], "paying": ["stribeck_friction@knee|ankle", CURVE]}
+COVERED["joints"]["hip"]["effects"] = ["torque_over_position"]
 
 
 @pytest.mark.parametrize(
     ("content", "run", "headline"),
     [
+        (COVERED, {}, "Missing: Stribeck friction at knee, ankle. Covered by a curve: hip"),
         ({}, {}, "Missing: Stribeck friction at hip, knee, ankle"),
-        (MORE, {}, "Missing: Stribeck friction at hip, knee, ankle. More is missing on hip"),
+        (MORE, {}, "Missing: Stribeck friction at hip, knee, ankle. More is missing on hip (0.4 mrad, 40 floors)"),
         ({}, {"effects": ["stribeck_friction"]}, "What was missing is in this run: Stribeck friction"),
         (
             {},
@@ -75,12 +81,12 @@ MORE = {"joints": {**make_diagnosis()["joints"], "hip": {**make_diagnosis()["joi
         (
             {"added": [], "verdict": "unknown", "paying": [CURVE], "free_form": [CURVE]},
             {},
-            "Something is missing, and no known effect explains it: a curve takes its place",
+            "Something is missing, and no known effect has earned its name",
         ),
         (
             {"added": [], "verdict": "unknown", "paying": ["stribeck_friction", CURVE], "free_form": [CURVE]},
             {},
-            "Something is missing, and no known effect explains all of it: a curve takes its place",
+            "Something is missing, and no known effect has earned its name",
         ),
         (
             {"added": [], "verdict": "nothing_missing"},
@@ -122,7 +128,7 @@ def test_commands_in_the_advice_can_be_copied(tmp_path):
 def test_what_is_unknown_has_an_error_map(tmp_path):
     page = page_of(folder_with(tmp_path / "run", make_diagnosis("unknown")))
     assert "error-map" in page.ids
-    assert "no known effect explains it" in page.text and "explains 80 % of it" in page.text
+    assert "no known effect has earned its name" in page.text and "explains 80 % of it" in page.text
 
 
 def test_nothing_missing_needs_no_chart(tmp_path):
