@@ -360,7 +360,7 @@ def test_a_training_keeps_its_drives(result, tmp_path, no_export):
     cfg = load_cfg(read)
     assert cfg.scene.robot.actuators["legs"].delay_s == pytest.approx(3.4 * DT) and cfg.sim.dt == DT
     played = run_script("play", "--checkpoint", run, "--num_envs", "2", "--seconds", "0.1", cwd=ROOT)
-    assert played.returncode == 0 and "identified drives: physics and drives run at 2.5 ms" in played.stdout
+    assert played.returncode == 0 and "identified drives: drives 2.5 ms, physics 2.5 ms, as in the fit" in played.stdout
 
 
 def test_a_finer_step_keeps_the_controllers_rate_with_effects_too(result):
