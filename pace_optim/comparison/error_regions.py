@@ -134,7 +134,8 @@ def _plain(
         return None
     still = next((d.bin == 0 for d in dimensions if d.name == "speed"), np.zeros(len(error), dtype=bool))
     constant = (
-        f"the error is nearly constant, {position_text(mean, [joint_type]).replace('-', '−')}: a torque, a friction or "
+        f"the error is nearly constant, {position_text(mean, [joint_type]).replace('-', '−')} (simulated less measured): a torque, a "
+        "friction or "
         "an encoder bias is missing."
     )
     for by, text, share, base, mask in (

@@ -166,3 +166,26 @@ def test_a_command_can_be_copied_where_joints_have_spaces_and_there_are_several(
     folder = write_run(tmp_path / "run")
     write_json(folder / "diagnosis.json", make_diagnosis() | {"added": ["torque_ripple@A1 shoulder|A2"], "paying": []})
     assert "--effects 'torque_ripple@A1 shoulder|A2'" in page_of(folder).text
+
+
+def test_a_curve_has_a_table_of_its_knots(tmp_path):
+    """A user could not write a friction law from "9 values: see the report"."""
+    knots = {
+        "variable": "speed [rad/s]",
+        "value": "friction [N m]",
+        "at": [0.0, 0.24, 0.63],
+        "torque": [6.4, 4.39, 3.86],
+    }
+    folder = write_run(tmp_path / "run")
+    make_result(curves={"friction_over_speed": {"knee": knots}}).save(folder / "result.json")
+    text = page_of(folder).text
+    assert "knee, speed [rad/s] 0 0.24 0.63" in text and "friction [N m] 6.4 4.39 3.86" in text
+
+
+def test_the_top_of_the_page_has_law_size_and_error_of_each_joint(tmp_path):
+    content = make_diagnosis()
+    size = {"effect": "stribeck_friction", "parameter": "effort", "joint": "knee", "value": 1.8, "std": 0.01}
+    content["sizes"] = [size | {"unit": "N m", "factor": None, "at_bound": False}]
+    content["joints"]["knee"]["training_rmse"] = 6e-4
+    top = page_of(folder_with(tmp_path / "run", content)).text.partition("Error of each joint")[0]
+    assert "knee stribeck_friction effort 1.8 ± 0.01 N m 4.30 0.400 / 0.600 2 / 3" in " ".join(top.split())

@@ -18,10 +18,10 @@ from pace_optim.diagnosis.checks.stated_facts import excluded_effects
 from pace_optim.diagnosis.findings import findings
 from pace_optim.diagnosis.findings.findings import Findings, evidence_of, more_missing, verdict_of
 from pace_optim.diagnosis.search.state import Outcome
-from pace_optim.diagnosis.selection.naming import DIFFERS, doubts
+from pace_optim.diagnosis.selection.naming import CURVE_LEAVES_LESS, DIFFERS, doubts
 from pace_optim.diagnosis.selection.size_consistency import sizes_apart, unevenness
 from pace_optim.diagnosis.verdict import names as names_module
-from pace_optim.diagnosis.verdict.names import Hint, earned_names, shares_of
+from pace_optim.diagnosis.verdict.names import Hint, Names, beside_curves, earned_names, shares_of
 from pace_optim.diagnosis.verdict.sizes import error_bars_from_none
 from pace_optim.diagnosis.verdict.verdict import part_explained, verdict
 from pace_optim.joints.fits.fitted import Fitted
@@ -322,6 +322,17 @@ def test_a_joint_that_is_far_from_the_noise_in_training_alone_is_named(bench):
     assert more_missing(found, bench.problem) == {}
     found = replace(found, trained=torch.tensor([6e-4]))
     assert more_missing(found, bench.problem) == {"servo": "0.6 mrad in training, 6 floors"}
+
+
+def test_an_effect_that_a_curve_replaces_becomes_a_hint(bench):
+    """Stribeck friction took 98 % on two calves, and the output said that no known effect explained them."""
+    outcome = ended(bench, 6.2e-4, (STRIBECK, [True], [5.0, 0.3]), before=4.16e-3)
+    evidence = {(STRIBECK, 0): make_evidence(4.16e-3**2, 6.2e-4**2, 1.4e-4**2)}
+    names = Names(outcome=outcome, named=YES, hints=[], evidence=evidence)
+    (hint,) = beside_curves(outcome, names, YES)
+    assert (hint.effect, hint.joint, hint.doubts) == ("stribeck_friction", 0, [CURVE_LEAVES_LESS])
+    assert hint.explained == pytest.approx(0.979, abs=1e-3) and hint.sizes[0]["value"] == pytest.approx(5.0)
+    assert beside_curves(outcome, names, ~YES) == []
 
 
 def test_what_is_unknown_is_told_with_what_comes_nearest(bench):
