@@ -19,8 +19,9 @@ AT_THE_FLOOR = 1.1
 NEGLIGIBLE = 1e-6
 """Errors below this are negligible [rad]."""
 MOST_PLACES = 3
-MOST = 0.75
-"""An error of which its mean, or standstill, holds this part is called so."""
+_CONSTANT, _STANDING = 0.75, 0.5
+"""An error is called nearly constant where its mean holds this part of its square, and one at standstill where that
+does: plainer than any region."""
 CONSTANT = "constant"
 """Stands in place of a dimension where the mean holds the error."""
 _OVERLAP = 0.5
@@ -133,16 +134,17 @@ def _plain(
     if total <= 0:
         return None
     still = next((d.bin == 0 for d in dimensions if d.name == "speed"), np.zeros(len(error), dtype=bool))
+    size = position_text(mean, [joint_type]).replace("-", "−")
     constant = (
-        f"the error is nearly constant, {position_text(mean, [joint_type]).replace('-', '−')} (simulated less measured): a torque, a "
-        "friction or "
-        "an encoder bias is missing."
+        f"the error is nearly constant, {size} (simulated less measured): a torque, a friction or an encoder bias is "
+        "missing."
     )
-    for by, text, share, base, mask in (
-        (CONSTANT, constant, mean**2 / total, 0.0, None),
-        ("speed", STANDING, float(above[still].sum()) / (total * len(error)), float(still.mean()), still),
+    at_rest = float(above[still].sum()) / (total * len(error))
+    for by, text, least, share, base, mask in (
+        (CONSTANT, constant, _CONSTANT, mean**2 / total, 0.0, None),
+        ("speed", STANDING, _STANDING, at_rest, float(still.mean()), still),
     ):
-        if share >= MOST and share > base:
+        if share >= least and share > base:
             share = min(share, 1.0)
             return Place(joint=joint, by=(by,), text=text, share=share, base=base, weight=total * share, mask=mask)
     return None

@@ -9,7 +9,7 @@ from pace_actuators.text import percent, short_duration
 from .dimensions import SWING, Dimension
 from .regions import Region
 
-STANDING = "while the joint stands still"
+STANDING = "where the joint stands still"
 _OF = {
     "velocity": "at velocities ",
     "acceleration": "at accelerations ",

@@ -227,7 +227,7 @@ def test_an_error_at_standstill_is_called_so_however_long_the_joint_stands():
     position = np.where(TIME < 17.0, 0.3, 0.3 + 0.2 * np.sin(2 * np.pi * (TIME - 17.0)))
     error = np.where(TIME < 17.0, 1e-3, 2e-4) * np.sign(np.sin(2 * np.pi * 0.3 * TIME))
     (place,) = compare_joint("knee", 0, [track(error, position)]).places
-    assert place.by == ("speed",) and "lies while the joint stands still (8" in place.sentence
+    assert place.by == ("speed",) and "lies where the joint stands still (8" in place.sentence
 
 
 def test_an_error_at_high_speed_is_said_to_be_there():
