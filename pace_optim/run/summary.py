@@ -38,8 +38,8 @@ def summary(result: FitResult) -> list[str]:
         lines.append(f"±: one standard deviation, which includes noise, {step}{rate}")
     lines.append(f"{error_line(result)}; {units_for(f'score {result.score:.3e} rad²', result.joint_types)}")
     if result.times_noise and not result.std_means_nothing:
-        more = ": something is missing" if result.times_noise >= ABOVE_NOISE else ""
-        lines.append(f"training error: {result.times_noise:.3g} times the measurement noise{more}")
+        said = above_noise(result) or f"{result.times_noise:.3g} times the measurement noise"
+        lines.append(f"training error: {said}")
     if result.torque_noise:
         lines.append(f"error of torques: {', '.join(_torque_errors(result))} (train / validation)")
     if result.objective:
@@ -52,6 +52,12 @@ def summary(result: FitResult) -> list[str]:
     lines += [f"note: {finding}" for finding in result.findings]
     lines += [f"warning: {warning}" for warning in shortened(result.warnings, "warning")]
     return lines + ["meaning and cure of each code: docs/faq.md"] * any("[W" in warning for warning in result.warnings)
+
+
+def above_noise(result: FitResult) -> str:
+    """How far above the noise a fit has ended, where something is missing; else empty."""
+    times = result.times_noise or 0.0
+    return f"{times:.3g} times the measurement noise: something is missing" if times >= ABOVE_NOISE else ""
 
 
 def error_line(result: FitResult, of: str = "error, all joints") -> str:

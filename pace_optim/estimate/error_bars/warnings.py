@@ -134,7 +134,7 @@ def _of_links(labels: Sequence[str]) -> list[str]:
 def _alike(groups: Sequence[tuple[str, ...]]) -> list[str]:
     """Confounded parameters, with the joints."""
     kinds: dict[tuple[str, ...], list[str]] = {}
-    for group in groups:
+    for group in (own for own in groups if not any(set(own) < set(other) for other in groups)):
         keys = {label.split("/", 1)[1] for label in group} - {GLOBAL}
         kind = tuple(label.split("/")[0] for label in group) if len(keys) == 1 else group
         kinds.setdefault(kind, []).extend(sorted(keys) if len(keys) == 1 else [])

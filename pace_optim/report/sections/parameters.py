@@ -205,7 +205,7 @@ def _flags(run: RunData, label: str, value: float) -> Markup:
         flags.append("not determined: its prior")
     elif label in result.no_influence:
         flags.append("no influence")
-    for group in result.indistinguishable:
+    for group in () if result.std_means_nothing else result.indistinguishable:
         if label in group:
             others = [_beside(other, label) for other in group if other != label]
             flags.append("cannot be separated from " + " and ".join(dict.fromkeys(others)))
