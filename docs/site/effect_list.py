@@ -19,6 +19,8 @@ Effects extend the base model of armature, viscous friction, Coulomb friction, e
 | `NAME@JOINTS@shared` | one value for some joints |
 | `…@wide` | bounds as wide as physics allows |
 
+A positive torque turns the joint towards larger positions.
+
 At its null value an effect vanishes exactly. A parameter without a null value shapes the effect, and matters only where
 the effect acts.
 
