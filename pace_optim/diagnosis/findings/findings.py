@@ -134,7 +134,7 @@ def told(
             *advise(problem, found.outcome, found.verdict, found.data, found.absorbed),
         ],
         runs=[str(folder)],
-        tried=[effect.name for effect in candidates],
+        tried=[e.name for e in candidates if bool(found.outcome.base.model.allowed_joints(e).any())],
         physics_dt=problem.physics_dt,
         error_map=error_map(
             found.curves,

@@ -32,7 +32,8 @@ def lines_of(diagnosis: Diagnosis) -> list[str]:
             f"{joint} {' -> '.join(three_figures(1e3 * rmse) for rmse in both)}"
             for joint, both in entry.get("tried", {}).items()
         ]
-        lines.append(f"  {entry['effect']:26s} {entry.get('status', ''):12s}  {listed(own, SHOWN)}")
+        name = entry["effect"] + (f" (round {entry['round']})" if entry["round"] > 1 else "")
+        lines.append(f"  {name:26s} {entry.get('status', ''):12s}  {listed(own, SHOWN)}")
     return lines + [f"- {sentence}" for sentence in shortened(diagnosis.data, "note")]
 
 

@@ -158,7 +158,7 @@ def _error_map(content: dict[str, Any]) -> Markup:
     said = bullets([f"{name}: {joint['sentence']}" for name, joint in joints.items()], "notes")
     about = (
         "part of the squared error above the floor that a curve of any form explains by itself, "
-        "on top of the base model"
+        "on top of the base model; curves that explain as much are one cause over several variables"
     )
     shown = table(["curve", *joints], rows)
     return _titled("What carries the error", said + _curve(content, joints) + shown, about)

@@ -53,7 +53,11 @@ def _plain_headline(result: FitResult) -> str:
     errors = result.rmse.get("validation") or result.rmse["train"]
     times = result.times_noise * errors[ALL] / result.rmse["train"][ALL]
     where = "on held-out data" if result.rmse.get("validation") else "on the training data"
-    return f"{times:.2g} times the noise {where}: something is missing" if times >= ABOVE_NOISE else f"At the noise {where}"
+    return (
+        f"{times:.2g} times the noise {where}: something is missing"
+        if times >= ABOVE_NOISE
+        else f"At the noise {where}"
+    )
 
 
 def _follows(result: FitResult) -> str:

@@ -97,7 +97,8 @@ def _drive(own: dict[str, Any]) -> list[str]:
         f"{own['asked_rms']:.3g}",
         _number(limit),
         f"{own['gravity_peak']:.3g}",
-        _beyond(own["speed_peak"], own["velocity_limit"]),
+        # without a stall torque there is no torque-speed line, and the limit does not act
+        _beyond(own["speed_peak"], None if own["saturation_effort"] is None else own["velocity_limit"]),
         _number(own["velocity_limit"]),
     ]
 

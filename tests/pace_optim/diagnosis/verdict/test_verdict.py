@@ -13,6 +13,7 @@ from run_folders import write_run
 from pace_actuators.effects import get_effect
 from pace_actuators.files import write_json
 from pace_actuators.text import percent, size_text
+from pace_optim.commands.diagnose import run_and_tell
 from pace_optim.diagnosis import Diagnosis
 from pace_optim.diagnosis.findings.text import lines_of, size_lines
 from pace_optim.diagnosis.search.state import Outcome
@@ -83,6 +84,27 @@ def test_the_verdict_is_printed_first_then_likes_and_advice_and_sizes_with_the_f
     assert lines[2:4] == ["torque_gain cannot be separated from payload.", "- Record more."]
     (size,) = size_lines(content["sizes"])
     assert size.startswith("  torque_gain.gain of knee: ") and size.endswith("times what was stated, at its bound")
+
+
+def test_a_command_prints_the_verdict_once_and_the_three_next_steps_last(tmp_path, monkeypatch, capsys):
+    """It stood before and after the fit of the whole robot."""
+    runs = [str(write_run(tmp_path / name)) for name in ("run", "refit")]
+    found = Diagnosis(
+        **make_diagnosis() | {"runs": runs, "paying": ["stribeck_friction"], "evidence": ["It explains."]}
+    )
+
+    def diagnosed(_, on_verdict):
+        on_verdict(found)
+        return found
+
+    monkeypatch.setattr("pace_optim.commands.diagnose.diagnose", diagnosed)
+    run_and_tell(None)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "each joint alone: effect, stribeck_friction; the fit of the whole robot decides"
+    assert lines.count(found.summary) == lines.count("It explains.") == lines.count("verdict: effect") == 1
+    assert [line.partition(":")[0] for line in lines[-5:]] == ["next", "next", "next", "report", "run"]
+    (row,) = (line for line in lines if line.startswith("  stribeck_friction"))
+    assert row.split(maxsplit=2)[1:] == ["added", "hip 4.30 -> 0.400, knee 4.30 -> 0.400, ankle 4.30 -> 0.400"]
 
 
 def test_the_report_opens_with_the_verdict_its_sizes_and_the_run_that_has_it(tmp_path):
