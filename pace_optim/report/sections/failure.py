@@ -164,7 +164,7 @@ def _over_time(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str
     ]
     return {
         "text": f"Error {errors}; noise {position_text(floor, types_of(joint))} ({source}), so "
-        f"{100 * one['share_above_floor']:.0f} % of the squared error is above it. Grey: ±2 σ of the noise"
+        f"{percent(one['share_above_floor'])} of the squared error is above it. Grey: ±2 σ of the noise"
         + ("; shaded: kept for validation." if shapes[1:] else "."),
         "traces": [{"x": time, "y": _numbers(curve[key], factor)} for key in ("low", "high")],
         "layout": {"yaxis": _title(f"error [{unit}]"), "shapes": shapes},
@@ -269,7 +269,7 @@ def _spectrum(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str,
     factor, unit = position_unit(bands["rms"], types_of(joint))
     text = "Nothing is above the noise."
     if bands["most"] is not None:
-        text = f"{100 * bands['most_share']:.0f} % of what is above the noise lies {bands['most']}."
+        text = f"{percent(bands['most_share'])} of what is above the noise lies {bands['most']}."
     rms, noise = (_numbers([value or None for value in bands[key]], factor) for key in ("rms", "noise_rms"))
     return {
         "text": text + " Each point is a third of an octave.",
@@ -359,7 +359,7 @@ def _white(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str, An
         text = f"As good as white: the sample before explains {share:.2g} % of the variance."
     else:
         text = (
-            f"Not white: the sample before explains {share:.0f} % of the variance, and errors stay alike for "
+            f"Not white: the sample before explains {percent(share / 100)} of the variance, and errors stay alike for "
             f"{short_duration(time)}. Something that can be modelled is left."
         )
     return {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,9 +40,11 @@ def _in_short(run: RunData) -> Markup:
 
 
 def _laws(content: dict[str, Any]) -> Markup:
-    """Of each joint the law that was found, how large it is, and the error before and after, also in floors."""
-    joints = content["joints"]
-    types = [joint.get("type", "hinge") for joint in joints.values()]
+    """Of each joint the law that was found, how large it is, and the error before and after, also in floors.
+
+    Joints without a law that end near their floor share a row, with the largest of their errors.
+    """
+    joints, types = content["joints"], [joint.get("type", "hinge") for joint in content["joints"].values()]
     curves = {label.partition("@")[0] for label in content.get("free_form", [])}
     sizes: dict[tuple[str, str], list[str]] = {}
     for (effect, parameter, text), own in sizes_by_joints(content.get("sizes", [])).items():
@@ -49,27 +52,30 @@ def _laws(content: dict[str, Any]) -> Markup:
             sizes.setdefault((effect, name), []).append(f"{parameter} {text}")
     rows = []
     for (name, joint), own in zip(joints.items(), types, strict=True):
-        after = [joint["validation_rmse_after"], joint.get("training_rmse")]
-        known = [error for error in after if error is not None]
-        laws = [f"curve: {in_words(effect).lower()}" if effect in curves else effect for effect in joint["effects"]]
-        size = [
-            "knots: see the diagnosis" if effect in curves else ", ".join(sizes.get((effect, name), ["–"]))
-            for effect in joint["effects"]
-        ]
-        rows.append(
-            [
-                bold(joint_label(name, own, types)),
-                "; ".join(laws) or "–",
-                "; ".join(size) or "–",
-                three_figures(1e3 * joint["validation_rmse_before"]),
-                " / ".join(three_figures(1e3 * error) for error in known),
-                " / ".join(f"{error / joint['floor']:.2g}" for error in known),
-            ]
-        )
+        if joint["effects"] or name in content.get("more", {}):
+            laws = [f"curve: {in_words(effect).lower()}" if effect in curves else effect for effect in joint["effects"]]
+            size = ["; ".join(sizes.get((effect, name), [])) for effect in joint["effects"]]
+            knots = ["knots: see the diagnosis"] if curves & set(joint["effects"]) else []
+            about = [", ".join(laws) or "–", "; ".join([*filter(None, size), *knots]) or "–"]
+            rows.append([bold(joint_label(name, own, types)), *about, *_errors([joint])])
+    others = [j for name, j in joints.items() if not j["effects"] and name not in content.get("more", {})]
+    if others:
+        which = f"{'other' if rows else 'all'} joints ({len(others)}): the largest"
+        rows.append([which, "–", "–", *_errors(others)])
     parts = " (validation / training)" if any(joint.get("training_rmse") for joint in joints.values()) else ""
     unit = units_for("mrad", types)
-    head = ["joint", "law found", "size ± standard deviation", f"before [{unit}]", f"left [{unit}]{parts}", "floors"]
+    head = ["joint", "law found", "size", f"before [{unit}]", f"left [{unit}]{parts}", "left in floors"]
     return table(head, rows, "laws")
+
+
+def _errors(joints: Sequence[dict[str, Any]]) -> list[str]:
+    """The largest error before and after, in validation and training, and the latter in floors."""
+    keys = [key for key in ("validation_rmse_after", "training_rmse") if joints[0].get(key) is not None]
+    return [
+        three_figures(1e3 * max(joint["validation_rmse_before"] for joint in joints)),
+        " / ".join(three_figures(1e3 * max(joint[key] for joint in joints)) for key in keys),
+        " / ".join(f"{max(joint[key] / joint['floor'] for joint in joints):.2g}" for key in keys),
+    ]
 
 
 def headline(run: RunData) -> str:
