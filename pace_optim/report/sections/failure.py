@@ -354,12 +354,12 @@ def _loops(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str, An
 def _white(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str, Any]:
     content = joint["recordings"][r]["whiteness"]
     lag, rho = content["lag"], content["autocorrelation"]
-    share, time = 100 * content["predictable"], content["correlation_time"]
+    share, time = content["predictable"], content["correlation_time"]
     if abs(content["lag_1"]) < 0.1:
-        text = f"As good as white: the sample before explains {share:.2g} % of the variance."
+        text = f"As good as white: the sample before explains {percent(share)} of the variance."
     else:
         text = (
-            f"Not white: the sample before explains {percent(share / 100)} of the variance, and errors stay alike for "
+            f"Not white: the sample before explains {percent(share)} of the variance, and errors stay alike for "
             f"{short_duration(time)}. Something that can be modelled is left."
         )
     return {
