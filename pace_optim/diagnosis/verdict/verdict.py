@@ -138,8 +138,11 @@ def _status(this: Round, effect: type[Effect], outcome: Outcome) -> str:
     for j, trials in enumerate(this.trials):
         best = min([float(outcome.final_errors.mse[j]), *(t.mse_after for t in trials if t.effect is this.chosen[j])])
         for trial in (t for t in trials if t.effect is effect and t.significant):
-            near = within(trial.mse_after, best, outcome.cfg.judging.alike)
-            found.add("would pay" if trial.mse_after < best and not near else "as good" if near else "leaves more")
+            alike = outcome.cfg.judging.alike
+            if not within(best, trial.mse_after, alike):
+                found.add("would pay")
+            else:
+                found.add("as good" if within(trial.mse_after, best, alike) else "leaves more")
     return next(each for each in STATUS if each in found)
 
 
