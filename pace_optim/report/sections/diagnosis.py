@@ -167,7 +167,7 @@ def _error_map(content: dict[str, Any]) -> Markup:
 def _curve(content: dict[str, Any], joints: dict[str, dict[str, Any]]) -> Markup:
     """The curve of each joint: a figure of all over the same variable, and a table of their knots."""
     shown = {name: joint for name, joint in joints.items() if joint["curve"]}
-    parts = []
+    parts: list[Markup] = []
     for label in dict.fromkeys((joint["best_label"], joint["kind"]) for joint in shown.values()):
         own = {name: joint for name, joint in shown.items() if (joint["best_label"], joint["kind"]) == label}
         parts.append(_knots(own, units_for("N m", _types(content, own)), len(parts)))
