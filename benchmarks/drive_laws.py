@@ -24,7 +24,7 @@ import numpy as np
 from drive_laws_plant import CONTROL_DT, NOISE, PLANT_DT, Law, Plan, State, drawn_base, plans, simulate, with_loads
 
 from pace_optim.diagnosis import candidate_effects, search_effects
-from pace_optim.diagnosis.findings.findings import Findings, summary_of
+from pace_optim.diagnosis.findings.findings import Findings, evidence_of, verdict_of
 from pace_optim.diagnosis.selection.decisions import Decision, as_lines
 from pace_optim.diagnosis.verdict.free_curves import error_map
 from pace_optim.diagnosis.verdict.sizes import sizes
@@ -314,7 +314,7 @@ def _told(found: Findings, problem: Problem, fits: Fits, case: Case) -> dict[str
         "before": 1e3 * float(outcome.base_errors.mse.mean().sqrt()),
         "after": 1e3 * float(outcome.final_errors.mse.mean().sqrt()),
         "floor": 1e3 * float(found.data.floor.square().mean().sqrt()),
-        "summary": summary_of(found, problem),
+        "summary": " ".join([verdict_of(found, problem), *evidence_of(found, problem)]),
         "sizes": sizes(fits, outcome, found.data.floor, problem.joint_names),
     }
 

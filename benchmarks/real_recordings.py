@@ -114,7 +114,7 @@ def diagnose_command(args: argparse.Namespace) -> None:
     """Diagnose the newest run of a robot."""
     run = newest_run(ROBOTS[args.robot], args.log_dir)
     found = diagnose(DiagnosisSettings(run=str(run), max_effects=args.max_effects, device=args.device))
-    print(f"{found.verdict}: {found.summary}")
+    print(f"{found.verdict}: {found.summary}", *found.evidence, sep="\n")
     for name, joint in found.joints.items():
         before, after = (1e3 * joint[f"validation_rmse_{when}"] for when in ("before", "after"))
         print(f"  {name:20s} {before:7.2f} -> {after:7.2f} mrad  {', '.join(joint['effects'])}")

@@ -79,7 +79,7 @@ def identify(folder: Path, seed: int) -> dict[str, str]:
     files = record(folder, seed)
     _, base = fit(FitSettings(task=ROBOT, optimizer="least_squares", log_dir=str(folder / "fits"), **files))
     diagnosis = diagnose(DiagnosisSettings(run=base, max_effects=2))
-    print(diagnosis.summary)
+    print(diagnosis.summary, *diagnosis.evidence, sep="\n")
     runs = {"base": str(base), "diagnosed": str(diagnosis.runs[-1]), "verdict": diagnosis.verdict}
     done.write_text(json.dumps(runs, indent=2))
     return runs

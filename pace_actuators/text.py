@@ -44,6 +44,16 @@ def shortened(sentences: Sequence[str], kind: str) -> list[str]:
     return [*shown, f"{plural(len(rest), f'more {kind}')}{which} in report.html"]
 
 
+def percent(share: float) -> str:
+    """A share as "61 %", "99.7 %" or "0.4 %": what is not all is never 100 %, and what is something is never 0 %."""
+    whole = 100 * share
+    if 0 < abs(whole) < 0.1:
+        return "below 0.1 %"
+    if 99.95 <= whole < 100:
+        return "over 99.9 %"
+    return f"{whole:.1f} %" if 99.5 <= whole < 100 else f"{whole:.0f} %" if abs(whole) >= 0.5 else f"{whole:.1g} %"
+
+
 def plural(count: int, noun: str) -> str:
     """A count of things: "1 joint", "3 joints"."""
     return f"{count} {noun}{'' if count == 1 else 's'}"

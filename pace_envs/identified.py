@@ -63,7 +63,7 @@ def use_identified(
         own_step: Keep the environment's physics step.
 
     Returns:
-        What was changed of the step, and what the environment cannot represent, in words.
+        What the environment cannot represent, in words.
 
     Raises:
         ValueError: If the result is unusable, or its joints are not the robot's.
@@ -79,8 +79,6 @@ def use_identified(
         at = min([drives.at.control_dt, *drives.drive.get("drive_dt", {}).values()])
         if abs(cfg.sim.dt - at) < 1e-9 and drives.at.physics_dt < at * (1 - 1e-6) and not own_step:
             set_physics_dt(cfg, drives.at.physics_dt)
-            step = f"physics steps of {1e3 * cfg.sim.dt:g} ms"
-            notes.append(f"{step}, as in the identification; the drives keep their {1e3 * at:g} ms.")
     if randomize_std is not None:
         cfg.events = {
             **cfg.events,
@@ -112,16 +110,16 @@ def doubts(cfg: ManagerBasedEnvCfg, identified: IdentifiedDrives | str | Path) -
 
 def doubts_of_fit(drives: IdentifiedDrives) -> list[str]:
     """Why the values of a fit may not be the robot's, in sentences; none if all is well."""
-    found = []
-    if drives.times_noise is not None and drives.times_noise >= _FAR_ABOVE_NOISE:
+    found, far = [], drives.times_noise is not None and drives.times_noise >= _FAR_ABOVE_NOISE
+    if far:
         found.append(
             f"the fit ended at {drives.times_noise:,.0f} times the measurement noise, so its values compensate for "
             "missing physics. Find it with pace diagnose before you use them. [W22]"
         )
     if drives.at_bound:
         found.append(
-            f"{listed(drives.at_bound, _MOST)} ended at a bound of the fit, so the value is the bound's. Widen bounds "
-            "and fit again. [W23]"
+            f"{listed(drives.at_bound, _MOST)} ended at a bound of the fit, so the value is the bound's. "
+            f"{'Find the missing physics' if far else 'Widen bounds and fit again'}. [W23]"
         )
     return found
 
@@ -164,7 +162,26 @@ def set_identified_step(cfg: ManagerBasedEnvCfg, identified: IdentifiedDrives | 
     if dt >= before * (1 - 1e-6) or abs(whole - round(whole)) > 1e-6:
         return None
     set_step(cfg, dt)
-    return f"physics and drives run at {1e3 * dt:g} ms, as in the identification, not at {1e3 * before:g} ms"
+    return step_note(cfg, drives, before)
+
+
+def step_note(cfg: ManagerBasedEnvCfg, drives: IdentifiedDrives, before: float) -> str:
+    """At which steps drives and physics run, and what makes a fine step longer; empty if nothing was changed.
+
+    Args:
+        cfg: The environment with identified drives.
+        drives: These.
+        before: The task's own step [s].
+    """
+    step, control = cfg.sim.dt, drives.at.control_dt
+    if step >= before * (1 - 1e-6):
+        return ""
+    loop = max(step, min([control, *drives.drive.get("drive_dt", {}).values()]))
+    note = f"drives {1e3 * loop:g} ms, physics {1e3 * step:g} ms, as in the fit (task: {1e3 * before:g} ms)"
+    if step >= control * (1 - 1e-6):
+        return note
+    cure = f"fit again with --physics_dt {control:g} --drive_dt {control:g}"
+    return f"{note}. Fine steps are slow: to train faster, {cure} (docs/training.md)"
 
 
 def _other_drives(robot: ArticulationCfg, drives: IdentifiedDrives) -> list[str]:

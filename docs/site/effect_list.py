@@ -19,6 +19,8 @@ Effects extend the base model of armature, viscous friction, Coulomb friction, e
 | `NAME@JOINTS@shared` | one value for some joints |
 | `…@wide` | bounds as wide as physics allows |
 
+A positive torque turns the joint towards larger positions.
+
 At its null value an effect vanishes exactly. A parameter without a null value shapes the effect, and matters only where
 the effect acts.
 
@@ -44,7 +46,7 @@ other joints they are multiplied by kp / 85. Those of `presliding_friction` scal
 The last fourteen, `torque_over_…`, `friction_over_…`, `gain_over_…` and `inertia_over_position`, are free-form curves.
 Bounds of torques follow the drive. Curves are straight from knot to knot, at `center + reach · knot`, and constant
 beyond the last knot. They show what is missing, not why. `pace diagnose` compares them with the effects that it found,
-and takes a curve if no effect explains the error.
+and takes a curve if no effect explains the error. `result.json` (`curves`) and the report list their knots.
 
 `python docs/site/effect_list.py > docs/effects.md` makes this page. [Your own effect](your_own_effect.md) adds one.
 
@@ -64,8 +66,8 @@ Results call them `<effect>.<parameter>`.
 _LOOKS = """
 ## What you see, and what separates an effect from similar ones
 
-| effect | seen in the data | separated by recording |
-|---|---|---|
+| effect | seen in the data | part to check | separated by recording |
+|---|---|---|---|
 """
 _TWINS = """
 ## Which effects are confounded
@@ -105,7 +107,7 @@ def page() -> str:
     effects.sort(key=lambda effect: effect.free_form)
     parts = [_HEAD, *(_row(f"`{e.name}`", e.stage, f"`{e.equation}`", e.source) for e in effects)]
     parts += [_PARAMETERS, *(_parameter(e, p) for e in effects for p in e.parameters if not _is_told(e, p))]
-    parts += [_LOOKS, *(_row(f"`{e.name}`", e.looks, e.separates) for e in effects)]
+    parts += [_LOOKS, *(_row(f"`{e.name}`", e.looks, e.part or "–", e.separates) for e in effects)]
     twins = [
         _row(f"`{e.name}`", ", ".join(f"`{like}`" for like in (*e.twins, e.absorbed_by) if like), e.separates)
         for e in effects

@@ -18,6 +18,7 @@ def effect_page(effect: type[Effect], picture: str | None = None) -> str:
     parts.append(
         f"\n## Equation\n\n```text\n{effect.equation}\n```\n\nStage: {effect.stage}. Source: {effect.source}.\n"
     )
+    parts += [f"\nPart to check: {effect.part}.\n"] if effect.part else []
     parts.append("\n## Parameters\n\n| parameter | meaning | unit | bounds | null |\n|---|---|---|---|---|\n")
     parts += [_row(parameter) for parameter in effect.parameters]
     likes = [like for like in (*effect.twins, effect.absorbed_by) if like]

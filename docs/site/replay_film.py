@@ -34,8 +34,9 @@ def film(run: Path, recording: str | None = None) -> Path:
     """Write the film of one recording, the worst if none is named."""
     data = RunData.load(run)
     model, bias = data.model(), data.result.parameters["encoder_bias"]
-    motions = motions_of(model, data.joint_names, data.worst_first(), [bias[name] for name in data.joint_names])
-    motion = next(each for each in motions if recording in (None, each.name))
+    name = recording or data.worst(1)[0].name
+    shown_ones = [each for each in data.recordings if each.name == name]
+    (motion,) = motions_of(model, data.joint_names, shown_ones, [bias[joint] for joint in data.joint_names])
     joints = scalar_joints(model)
     address, bodies = model.jnt_qposadr[joints], model.jnt_bodyid[joints]
     error = motion.simulated - motion.measured

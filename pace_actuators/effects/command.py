@@ -37,6 +37,7 @@ class CommandRateLimit(Effect):
         ),
     )
     equation = "|dq*/dt| <= v_max inside the drive"
+    part = "the profile velocity of the firmware"
     looks = "measured speed never exceeds a plateau"
     source = "profile velocity of servo firmware, e.g. Dynamixel control tables"
     probes = ({"velocity": 8.0}, {"velocity": 4.0}, {"velocity": 2.0}, {"velocity": 1.0}, {"velocity": 0.5})
@@ -84,6 +85,7 @@ class CommandAccelerationLimit(Effect):
         ),
     )
     equation = "|d²q*/dt²| <= a inside the drive, which stops at its command"
+    part = "the profile acceleration of the firmware"
     looks = "from some frequency on, the acceleration no longer rises: late and too wide in the fast parts"
     source = "profile acceleration of servo firmware, e.g. Dynamixel and Feetech control tables"
     probes = tuple({"acceleration": a} for a in (300.0, 150.0, 80.0, 40.0, 20.0, 10.0))
@@ -124,6 +126,7 @@ class CommandFilter(Effect):
     _target: torch.Tensor
     parameters = (EffectParameter(name="time_constant", unit="s", lower=0.0, upper=0.2, null=0.0, start=0.01),)
     equation = "T dx/dt + x = q*, the controller follows x"
+    part = "the firmware's filter or interpolation of commands"
     looks = "late and too small in the fast parts; rounded steps"
     source = "interpolation and input filters of servo and joint drives"
     probes = ({"time_constant": 0.003}, {"time_constant": 0.01}, {"time_constant": 0.04})
@@ -165,6 +168,7 @@ class OtherDelay(Effect):
         ),
     )
     equation = "τ(t - s) where the base delays q*, q*(t - s) where the base delays τ"
+    part = "whether bus or current loop is late"
     looks = "phase at the band's upper end, and less damping of the loop"
     source = "PACE (arXiv 2509.06342), delay modes of its releases"
     probes = ({"delay": 0.001}, {"delay": 0.003})
@@ -201,6 +205,7 @@ class ProportionalGain(Effect):
     stage = "controller"
     parameters = (EffectParameter(name="gain", unit="1", lower=0.1, upper=10.0, null=1.0, start=1.02, scale="log"),)
     equation = "g kp"
+    part = "the stated kp and its unit"
     looks = "static sag and stiffness off; parameters change from gain set to gain set"
     source = "EFFECTS of PACE on MuJoCo; users of PACE report drives whose gains are not in SI units"
     probes = ({"gain": 1.02}, {"gain": 0.4}, {"gain": 2.5})
@@ -221,6 +226,7 @@ class DerivativeGain(Effect):
     stage = "controller"
     parameters = (EffectParameter(name="gain", unit="1", lower=0.1, upper=10.0, null=1.0, start=1.05, scale="log"),)
     equation = "g kd"
+    part = "the stated kd and its unit"
     looks = "damping changes from gain set to gain set"
     source = "as proportional_gain"
     probes = ({"gain": 1.05}, {"gain": 0.3}, {"gain": 3.0})
@@ -246,6 +252,7 @@ class GravityCompensation(Effect):
         EffectParameter(name="share", unit="1", lower=-0.5, upper=2.0, null=0.0, start=0.1, plausible=(0.0, 1.5)),
     )
     equation = "τ - c τ_g, τ_g the torque of gravity and load on the joint"
+    part = "the controller's gravity feed-forward"
     looks = "the joint leans less than its load and gains say; at c = 1 it does not lean at all"
     source = "controllers of robot arms (e.g. Sawyer, Panda), which know their own dynamics"
     probes = ({"share": 0.1},)
@@ -278,6 +285,7 @@ class FastLoop(Effect):
         ),
     )  # fmt: skip
     equation = "τ - s (kp (q - q₀) + kd (v - v₀)), q₀ and v₀ as at the last command"
+    part = "the stated rate of the drive's loop"
     looks = "viscous friction and delay change from gain set to gain set"
     source = "position loops of servo drives, which run at 1 to 20 kHz whatever the bus does; drive_dt states it"
     probes = ({"share": 0.5}, {"share": 1.0})
@@ -325,6 +333,7 @@ class IntegralGain(Effect):
         ),
     )
     equation = "τ + ki ∫ (q* - q) dt, the integral's torque within ± τ_I"
+    part = "the I term of the firmware"
     looks = "the joint leans less and less while its command holds; it overshoots after a step"
     source = "PID position loops of servo drives, e.g. Dynamixel control tables; mjlab's integral_gain"
     probes = ({"effort": 100.0}, {"effort": 5.0}, {"effort": 1.0})

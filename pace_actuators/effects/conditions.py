@@ -75,6 +75,7 @@ class ThermalFriction(_OfCondition):
         EffectParameter(name="slope", unit="1/°C", lower=-0.05, upper=0.05, null=0.0, start=-0.005, meaning="k"),
     )
     equation = "1 + k (T - 25 °C) times F_c and d, T the motor's logged temperature"
+    part = "grease and seals of the gear"
     looks = "the hysteresis loop becomes narrower as the drive warms up"
     source = "Bittencourt, Gunnarsson 2012, static friction in a robot joint: load and temperature"
     separates = "the same motion again, cold and warm"
@@ -96,6 +97,7 @@ class ThermalTorque(_OfCondition):
         EffectParameter(name="slope", unit="1/°C", lower=-0.02, upper=0.02, null=0.0, start=-0.002, meaning="k"),
     )
     equation = "τ -> τ (1 + k (T - 25 °C)), T the motor's logged temperature"
+    part = "the motor's magnets, cooling"
     looks = "the joint sags and slows down as the motor warms up"
     source = "magnets lose 0.1 to 0.2 % of their flux per °C"
     separates = "the same motion again, cold and warm"
@@ -125,6 +127,7 @@ class SupplyVoltage(_OfCondition):
         ),
     )
     equation = "τ -> τ (1 + k (U / U_n - 1)), U the logged voltage"
+    part = "the battery, the voltage compensation"
     looks = "static sag and amplitude follow the battery"
     source = "a bridge that is switched: its mean voltage is a share of the supply's"
     probes = tuple({"nominal": u} for u in (7.0, 12.0, 24.0, 48.0))

@@ -21,6 +21,7 @@ class TorqueGain(Effect):
     stage = "drive"
     parameters = (EffectParameter(name="gain", unit="1", lower=0.1, upper=10.0, null=1.0, start=1.02, scale="log"),)
     equation = "τ -> g τ"
+    part = "torque constant, gear ratio, efficiency"
     looks = "static sag and amplitude off together"
     source = "a wrong torque constant, gear ratio or efficiency"
     probes = ({"gain": 1.02}, {"gain": 0.4}, {"gain": 2.5})
@@ -61,6 +62,7 @@ class TorqueFade(Effect):
         EffectParameter(name="time_constant", unit="s", lower=2.0, upper=2000.0, null=None, start=30.0, scale="log"),
     )
     equation = "τ -> τ (1 - h / E^2), T dh/dt + h = τ^2"
+    part = "the motor's cooling, its thermal limit"
     looks = "the joint sags and slows down more and more, the more it has worked"
     source = "magnets and windings lose torque with their temperature; I²t models of motor drives"
     probes = tuple({"effort": e, "time_constant": t} for t in (10.0, 100.0) for e in (300.0, 80.0, 25.0, 8.0, 2.0))
@@ -112,6 +114,7 @@ class SupplySag(Effect):
         ),
     )
     equation = "τ -> τ (1 - |τ| / E), at most E / 4"
+    part = "power supply, battery, cables"
     looks = "large torques fall short, small ones do not"
     source = "internal resistance of batteries and cables; saturation of magnetic circuits"
     probes = tuple({"effort": e} for e in (2000.0, 600.0, 200.0, 60.0, 20.0, 6.0, 2.0))
@@ -136,6 +139,7 @@ class DriveBandwidth(Effect):
     _torque: torch.Tensor
     parameters = (EffectParameter(name="time_constant", unit="s", lower=0.0, upper=0.03, null=0.0, start=0.002),)
     equation = "T dτ/dt + τ = clip(τ_cmd, ± τ_c)"
+    part = "the current loop's tuning"
     looks = "phase falls beyond what the delay explains"
     source = "current loop of a motor drive"
     probes = ({"time_constant": 0.001}, {"time_constant": 0.005}, {"time_constant": 0.015})
@@ -173,6 +177,7 @@ class TorqueRipple(Effect):
         ),
     )
     equation = "τ + a sin(N q) + b cos(N q)"
+    part = "the motor's poles, the gear's teeth"
     looks = "a comb over position"
     source = "cogging and commutation of a motor, seen through its gear"
     probes = tuple({"sine": a, "cosine": b} for a, b in ((0.1, 0.0), (0.0, 0.1)))
@@ -198,6 +203,7 @@ class TorqueLimit(Effect):
         EffectParameter(name="effort", unit="N m", lower=0.1, upper=200.0, null=_INFINITE, start=20.0, scale="log"),
     )
     equation = "|τ_cmd| <= τ_max, before current loop and torque constant"
+    part = "current limit, stated effort limit"
     looks = "peaks are cut, in the fast parts only"
     source = "current limit of a drive"
     probes = tuple({"effort": e} for e in (60.0, 40.0, 30.0, 20.0, 14.0, 10.0, 7.0, 5.0, 3.0, 1.0, 0.5, 0.3))
@@ -227,6 +233,7 @@ class OffDamping(Effect):
         ),
     )
     equation = "d + c in place of d while the drive is switched off"
+    part = "what the drive does when off: short circuit or open"
     looks = "the error sits where the drive is off: the joint falls or swings too fast or too slowly there"
     source = "open or shorted windings of a DC motor; torque_enable of servo firmware"
     probes = ({"damping": 0.1}, {"damping": 1.0})
@@ -269,6 +276,7 @@ class TorqueSpeedLimit(Effect):
         ),
     )
     equation = "|τ| <= τ_stall (1 - |v|/v_0) where τ v > 0"
+    part = "supply voltage, stated no-load speed"
     looks = "speed saturates"
     source = "DC motor at its supply's voltage"
     probes = tuple(

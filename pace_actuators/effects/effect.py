@@ -159,6 +159,8 @@ class Effect(Part):
     """Joints on which it means something: ``"hinge"``, ``"slide"`` or both. It is not tried on others."""
     equation: ClassVar[str] = ""
     """Its equation, as text."""
+    part: ClassVar[str] = ""
+    """The part of the robot to check where it is found."""
     looks: ClassVar[str] = ""
     """What a person would see in the data."""
     remark: ClassVar[str] = ""

@@ -66,6 +66,7 @@ class CreepingFriction(Effect):
         EffectParameter(name="velocity", unit="rad/s", lower=0.0, upper=0.5, null=0.0, start=0.02, meaning="v_s"),
     )
     equation = "F tanh(v / v_s) in place of F sgn(v)"
+    part = "grease, seals, a cable that yields"
     looks = "a joint that should stick creeps on under its load; soft reversals"
     source = "regularised Coulomb friction (e.g. Marques, Flores, Claro, Lankarani 2016); simulators' soft friction"
     probes = ({"velocity": 0.005}, {"velocity": 0.02}, {"velocity": 0.08}, {"velocity": 0.25})
@@ -111,6 +112,7 @@ class SoftFriction(Effect):
         ),
     )
     equation = "f = -clip(d (τ + M b v), ± F), b = 2 / (0.95 T), d = 0.9"
+    part = "none: the recording is from MuJoCo"
     looks = "a joint that should stick creeps on under its load; soft reversals"
     remark = (
         "soft_friction is MuJoCo's default for frictionloss: the log may come from a simulator. "

@@ -77,6 +77,16 @@ class FreeForm(Effect):
         }
 
     @classmethod
+    def law(cls, values: Mapping[str, float], friction: float, viscous_friction: float) -> dict[str, list[float]]:
+        """The curve, of a friction with all friction that there is: they share a part that cannot be separated."""
+        result = cls.curve(values)
+        if cls.kind == "friction" and cls.parameters[0].unit == "N m":
+            slope = viscous_friction if cls.variable == "speed" else 0.0
+            knots = zip(result["at"], result["torque"], strict=True)
+            result["torque"] = [max(0.0, friction + more) + slope * x for x, more in knots]
+        return result
+
+    @classmethod
     def _names(cls) -> list[str]:
         """Its values, by parameter."""
         return [p.name for p in cls.parameters if p.null is not None]

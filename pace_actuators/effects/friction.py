@@ -27,6 +27,7 @@ class StribeckFriction(Effect):
         ),
     )
     equation = "F(v) = F_c + F_s exp(-(v/v_s)^2)"
+    part = "the gear's lubrication, seals"
     looks = "error right after reversals and at creep; torque against speed dips, then rises"
     source = "Armstrong-Helouvry, Dupont, Canudas de Wit 1994"
     probes = ({"velocity": 0.03}, {"velocity": 0.1}, {"velocity": 0.3}, {"velocity": 0.8})
@@ -52,6 +53,7 @@ class DynamicFriction(Effect):
     stage = "friction"
     parameters = (EffectParameter(name="ratio", unit="1", lower=0.0, upper=1.0, null=1.0, start=0.8, meaning="r"),)
     equation = "F_c at rest, r F_c while sliding (beyond 0.02 rad/s)"
+    part = "the gear's lubrication, seals"
     looks = "as stribeck_friction of a narrow width: error right after reversals"
     source = "Bjelonic et al., PACE 0.2.0: dynamic friction as a ratio of static friction"
     probes = ({"ratio": 0.8},)
@@ -79,6 +81,7 @@ class LoadDependentFriction(Effect):
         EffectParameter(name="coefficient", unit="1", lower=0.0, upper=0.5, null=0.0, start=0.01, meaning="k_l"),
     )
     equation = "F = F_c + k_l |τ - τ_g|, τ_g the torque of gravity and load on the joint"
+    part = "the gear: worm, harmonic or planetary"
     looks = "the hysteresis loop widens with the load"
     source = "Duclusaud et al., BAM (Rhoban), model M3"
     probes = ({"coefficient": 0.01},)
@@ -106,6 +109,7 @@ class FrictionAsymmetry(Effect):
     stage = "friction"
     parameters = (EffectParameter(name="effort", unit="N m", lower=-1.5, upper=1.5, null=0.0, start=0.05),)
     equation = "F = F_c + a sgn(v)"
+    part = "a gear or bearing that is worn to one side; a tendon"
     looks = "up and down strokes differ"
     source = "BAM (Rhoban), directional friction"
     probes = ({"effort": 0.05},)
@@ -142,6 +146,7 @@ class QuadraticFriction(Effect):
         ),
     )
     equation = "τ - b2 v |v|"
+    part = "grease that is churned, fans, air"
     looks = "the error grows with speed, in both directions"
     source = "churning of a gear's oil; BAM (Rhoban)"
     probes = ({"coefficient": 0.02},)
@@ -166,6 +171,7 @@ class FrictionDrift(Effect):
         EffectParameter(name="time_constant", unit="s", lower=1.0, upper=600.0, null=None, start=30.0, scale="log"),
     )
     equation = "d and F_c times (1 + δ (1 - exp(-t/T)))"
+    part = "warm-up, wear, a screw that comes loose"
     looks = "the error grows or shrinks from recording to recording"
     source = "grease that warms up"
     probes = ({"time_constant": 5.0}, {"time_constant": 20.0}, {"time_constant": 80.0})
@@ -207,6 +213,7 @@ class PreslidingFriction(Effect):
         ),
     )
     equation = "dz/dt = v - σ0 |v| z / F, friction σ0 z"
+    part = "bearings, seals"
     looks = "soft loops at tiny amplitudes, no sharp stick"
     source = "Dahl 1968; Canudas de Wit, Olsson, Astrom, Lischinsky 1995"
     probes = ({"stiffness": 1000.0}, {"stiffness": 300.0}, {"stiffness": 100.0}, {"stiffness": 30.0})

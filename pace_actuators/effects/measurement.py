@@ -17,6 +17,7 @@ class EncoderScale(Effect):
     stage = "measurement"
     parameters = (EffectParameter(name="error", unit="1", lower=-0.1, upper=0.1, null=0.0, start=0.002),)
     equation = "q_enc = (1 + e) q - bias"
+    part = "counts per turn, gear ratio"
     looks = "amplitude off at all speeds"
     source = "e.g. a wrong gear ratio or a non-linear potentiometer"
     probes = ({"error": 0.002},)
@@ -45,6 +46,7 @@ class EncoderEccentricity(Effect):
         EffectParameter(name="cosine", unit="rad", lower=-0.05, upper=0.05, null=0.0, start=0.0),
     )
     equation = "q_enc = q + a sin q + b cos q - bias"
+    part = "the encoder disc or magnet: off centre"
     looks = "an error that repeats once per turn"
     source = "standard for magnetic and optical ring encoders"
     probes = ({"sine": 0.001, "cosine": 0.0}, {"sine": 0.0, "cosine": 0.001})
@@ -71,6 +73,7 @@ class VelocityFilter(Effect):
     _seen: torch.Tensor
     parameters = (EffectParameter(name="time_constant", unit="s", lower=0.0, upper=0.03, null=0.0, start=0.003),)
     equation = "T dv_ctrl/dt + v_ctrl = v"
+    part = "the firmware's filter of speeds"
     looks = "too little damping above a few Hz"
     source = "first-order low-pass in servo drives"
     probes = ({"time_constant": 0.002}, {"time_constant": 0.01})
@@ -98,6 +101,7 @@ class MeasurementDelay(Effect):
     stage = "recording"
     parameters = (EffectParameter(name="delay", unit="s", lower=0.0, upper=0.03, null=0.0, start=0.001),)
     equation = "q_logged(t) = q_enc(t - T)"
+    part = "the bus, the log's stamps"
     looks = "pure lag; the way the joint settles is not late"
     source = "logging over a bus or a network"
     probes = ({"delay": 0.001},)
@@ -121,6 +125,7 @@ class ClockSkew(Effect):
     shared = True
     parameters = (EffectParameter(name="skew", unit="1", lower=-0.005, upper=0.005, null=0.0, start=1e-4),)
     equation = "q_logged(t) = q_enc((1 + s) t)"
+    part = "the clocks of robot and logger"
     looks = "a phase error that grows with time in each recording"
     source = "two computers without a common clock"
     probes = ({"skew": 1e-4},)

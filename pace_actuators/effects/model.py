@@ -34,6 +34,7 @@ class Payload(Effect):
         EffectParameter(name="ratio", unit="1", lower=-0.6, upper=1.0, null=0.0, start=0.02, possible=(-1.0, 9.0)),
     )
     equation = "mass and inertia of the link times (1 + m)"
+    part = "the link's mass, tools, cables"
     looks = "sag and inertia off together"
     source = "cables, covers and tools that the model does not have"
     probes = ({"ratio": 0.02},)
@@ -56,6 +57,7 @@ class ComOffset(Effect):
     joint_types = ("hinge",)
     parameters = (EffectParameter(name="angle", unit="rad", lower=-0.3, upper=0.3, null=0.0, start=0.01),)
     equation = "centre of mass turned about the joint's axis by α"
+    part = "the link's centre of mass, the joint's zero"
     looks = "a lean that depends on the pose"
     source = "as payload"
     probes = ({"angle": 0.01},)

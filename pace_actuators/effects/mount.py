@@ -86,6 +86,7 @@ class MountCompliance(Effect):
         ),
     )
     equation = "J d²φ/dt² + c dφ/dt + k φ = - reaction of the joint; the link feels - I d²φ/dt² and gravity turned by φ"
+    part = "stand, clamps, screws of the base"
     looks = "a resonance common to several joints"
     source = "two-inertia system"
     probes = tuple({"stiffness": k, "inertia": j} for k in (4000.0, 1000.0, 400.0) for j in (0.4, 1.5))

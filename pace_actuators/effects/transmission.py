@@ -19,6 +19,7 @@ class TorqueOffset(Effect):
     stage = "transmission"
     parameters = (EffectParameter(name="effort", unit="N m", lower=-4.0, upper=4.0, null=0.0, start=0.1),)
     equation = "τ + τ_0"
+    part = "zero of the current sensor; a cable or spring that pulls"
     looks = "a constant lean"
     source = "offset of a current sensor, a pulling cable"
     probes = ({"effort": 0.1},)
@@ -56,6 +57,7 @@ class ParallelSpring(Effect):
         ),
     )
     equation = "τ - k (q - q_0)"
+    part = "a spring, a cable or a hose on the joint"
     looks = "a lean proportional to the angle"
     source = "cables and hoses along a joint; balancing springs"
     probes = ({"rest": 0.0}, {"rest": 1.0}, {"rest": -1.0})

@@ -256,6 +256,7 @@ class JointElasticity(_TwoMass):
         _SIDE,
     )
     equation = "J d²θ/dt² = τ - f - friction, link: + f, f = k (θ - q) + c (dθ/dt - dq/dt)"
+    part = "belt, harmonic drive, long shaft"
     looks = "resonance and anti-resonance; the base fit is overdamped with parameters at their bounds"
     source = "Spong 1987, flexible joint"
     probes = tuple({"stiffness": k, "encoder_side": e} for k in (5000.0, 1500.0, 500.0, 200.0) for e in (0.0, 1.0))
@@ -313,6 +314,7 @@ class Backlash(_TwoMass):
         _SIDE,
     )
     equation = "as joint_elasticity with f = k dz(θ - q, ± gap/2)"
+    part = "gear play, loose couplings and screws"
     looks = "loose around zero load, a step at reversals"
     source = "Nordin, Gutman 2002, dead-zone model"
     probes = tuple({"gap": g, "encoder_side": e} for g in (0.002, 0.008, 0.025) for e in (0.0, 1.0))

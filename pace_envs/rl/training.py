@@ -19,7 +19,7 @@ from pace_actuators import IdentifiedDrives
 from pace_actuators.drive_result import result_path
 from pace_actuators.text import listed
 from pace_envs.devices import find_device
-from pace_envs.identified import assumed_gains, doubts, set_identified_step, set_step, use_identified
+from pace_envs.identified import assumed_gains, doubts, set_identified_step, set_step, step_note, use_identified
 from pace_envs.lost_process import told_of_lost_processes
 from pace_envs.manager_based_rl_env import ManagerBasedRLEnv
 from pace_envs.registration import load_env_cfg, set_physics_dt
@@ -99,21 +99,21 @@ def _use_drives(cfg: TrainingEnvCfg, settings: RunSettings) -> None:
     drives = IdentifiedDrives.load(settings.identified)
     for doubt in doubts(cfg, drives):
         print(f"warning: identified drives: {doubt}", file=sys.stderr)
-    notes = [set_identified_step(cfg, drives)]
-    more = use_identified(
+    before = cfg.sim.dt
+    set_identified_step(cfg, drives)
+    notes = use_identified(
         cfg,
         drives,
         randomize_std=settings.randomize_identified,
         own_step=settings.physics_dt is not None,
     )
-    if settings.physics_dt is not None:
-        notes = []
+    if settings.physics_dt is None:
+        notes = [step_note(cfg, drives, before), *notes]
+    else:
         # a finer step leaves the drives' controllers at their rate; how it is taken depends on their effects
         (set_physics_dt if settings.physics_dt < cfg.sim.dt else set_step)(cfg, settings.physics_dt)
-    notes += more
-    for note in notes:
-        if note:
-            print(f"identified drives: {note}")
+    for note in filter(None, notes):
+        print(f"identified drives: {note}")
 
 
 def make_env(cfg: TrainingEnvCfg, render_mode: str | None = None) -> RslRlVecEnvWrapper:

@@ -6,7 +6,7 @@ import torch
 
 from pace_optim.comparison import compare, comparison_lines
 from pace_optim.run.result import FitResult
-from pace_optim.run.summary import next_line
+from pace_optim.run.summary import next_lines
 from pace_optim.terminal.cli import make_parser
 from pace_optim.terminal.options import (
     add_common_options,
@@ -51,7 +51,7 @@ def main() -> None:
     print(*comparison_lines(content), sep="\n")
     run = Path(content["run"])
     print(f"report: {run / 'report.html'}")
+    following = []
     if len(options["runs"]) == 1 and not options["data"] and not (run / "diagnosis.json").is_file():
-        for line in next_line(FitResult.load(run), run, compared=True):
-            print(line)
-    print(f"run: {run}")
+        following = next_lines(FitResult.load(run), run)
+    print(*following, f"run: {run}", sep="\n")

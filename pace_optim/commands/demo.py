@@ -104,7 +104,7 @@ def main() -> None:
     print(*_compared([base], progress), sep="\n")
     print("", "4. Diagnose: which effect is missing?", sep="\n", flush=True)
     diagnosis = diagnose(DiagnosisSettings(run=base, max_effects=2))
-    print(diagnosis.summary)
+    print(diagnosis.summary, *diagnosis.evidence, sep="\n")
     hidden = json.loads(Path(files["train"][0]).with_suffix(".truth.json").read_text())["effects"]
     print("", f"The truth: {', '.join(hidden)} on {args.effect_joints}.", sep="\n")
     if len(diagnosis.runs) > 1:

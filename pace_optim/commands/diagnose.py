@@ -5,9 +5,9 @@ from pathlib import Path
 import torch
 
 from pace_optim.diagnosis import DiagnosisSettings, diagnose
-from pace_optim.diagnosis.findings.text import lines_of, size_lines
+from pace_optim.diagnosis.findings.text import first_line, lines_of, size_lines
 from pace_optim.run.result import FitResult
-from pace_optim.run.summary import error_line, next_line, summary
+from pace_optim.run.summary import error_line, next_lines, summary
 from pace_optim.terminal.choices import MEASURED_FACTS
 from pace_optim.terminal.cli import make_parser
 from pace_optim.terminal.options import add_common_options, add_device_option, add_several, number, take_common_options
@@ -44,16 +44,15 @@ def main() -> None:
 
 
 def run_and_tell(settings: DiagnosisSettings) -> None:
-    """Diagnose; print the verdict before the robot is fitted again, then the sizes, that fit with its verdict."""
-    diagnosis = diagnose(settings, on_verdict=lambda found: print(*lines_of(found), sep="\n", flush=True))
+    """Diagnose; print one line before the robot is fitted again, then that fit, the verdict and what to do next."""
+    diagnosis = diagnose(settings, on_verdict=lambda found: print(first_line(found), flush=True))
     first, last = Path(diagnosis.runs[0]), Path(diagnosis.runs[-1])
     if not first.is_absolute() and last.is_relative_to(Path.cwd()):  # as the run was named
         last = last.relative_to(Path.cwd())
-    lines = size_lines(diagnosis.sizes)
+    fitted, lines = FitResult.load(last), []
     if first != last:
         with_what = [*(link["link"] for link in diagnosis.links), *diagnosis.paying]
-        before, refit = FitResult.load(first), FitResult.load(last)
-        lines = ["", f"whole robot with {' and '.join(with_what)}:", *summary(refit)]
-        lines += [error_line(before, "error before, all joints"), f"verdict: {diagnosis.verdict}", diagnosis.summary]
-        lines += next_line(refit, last)
+        lines = ["", f"whole robot with {' and '.join(with_what)}:", *summary(fitted)]
+        lines += [error_line(FitResult.load(first), "error before, all joints"), ""]
+    lines += [*lines_of(diagnosis), *size_lines(diagnosis.sizes), *next_lines(fitted, last, diagnosed=True)]
     print(*lines, f"report: {last / 'report.html'}", f"run: {last}", sep="\n")

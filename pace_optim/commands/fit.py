@@ -84,7 +84,7 @@ def main() -> None:
 
     from pace_optim.identification.fit import fit_with_torques, help_fit, resume
     from pace_optim.run.settings import FitSettings
-    from pace_optim.run.summary import next_line, summary
+    from pace_optim.run.summary import next_lines, summary
     from pace_optim.terminal.processes import join
 
     args = take_common_options(args)
@@ -115,7 +115,7 @@ def main() -> None:
         print(flush=True)
         run_and_tell(DiagnosisSettings(run=folder, device=device))
     else:
-        print(f"report: {folder / 'report.html'}", *([] if interrupted else next_line(result, folder)), sep="\n")
+        print(f"report: {folder / 'report.html'}", *([] if interrupted else next_lines(result, folder)), sep="\n")
         print(f"run: {folder}")
 
 

@@ -49,8 +49,8 @@ def _watch(run: RunData, recording: str | None, speed: float) -> None:
 
     model = run.model()
     bias = run.result.parameters["encoder_bias"]
-    motions = motions_of(model, run.joint_names, run.worst_first(), [bias[name] for name in run.joint_names])
+    motions = motions_of(model, run.joint_names, run.recordings, [bias[name] for name in run.joint_names])
     names = [motion.name for motion in motions]
     if recording is not None and recording not in names:
         raise ValueError(f"There is no recording {recording!r} in the run. Available: {', '.join(names)}.")
-    watch(model, motions[names.index(recording) if recording else 0], speed)
+    watch(model, motions[names.index(recording or run.worst(1)[0].name)], speed)

@@ -13,7 +13,7 @@ import numpy as np
 
 from pace_actuators.files import write_together
 from pace_actuators.joint_units import joint_label, units_for
-from pace_actuators.text import listed, position_unit, shortened, three_figures
+from pace_actuators.text import listed, percent, position_unit, shortened, three_figures
 from pace_optim.recording.noise import noise_floor
 from pace_optim.report import check_folder, report_text
 from pace_optim.run.open import run_folder
@@ -192,7 +192,7 @@ def comparison_lines(content: dict[str, Any]) -> list[str]:
     lines = [f"{head}   [{units_for(unit, types)}]"]
     for label, joint in zip(labels, joints.values(), strict=True):
         cells = "".join(_cell(joint["rmse"].get(part), factor) for part in parts)
-        share = f"{100 * joint['share_above_floor']:.0f} %"
+        share = percent(joint["share_above_floor"])
         lines.append(f"{label:{width}}{cells}{_cell(joint['noise_floor'], factor)}  {share:>11}")
     lines += _split(content, factor, "recording", [each["name"] for each in content["recordings"]])
     lines += _split(content, factor, "drive", ["off", "on"])

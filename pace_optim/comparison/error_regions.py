@@ -8,17 +8,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from pace_actuators.joint_units import JointType
-from pace_actuators.text import position_text, position_unit
+from pace_actuators.text import percent, position_text, position_unit
 
 from .dimensions import Dimension
 from .regions import Layout, Region, best_region, evidence, inside, refine
-from .words import band_text, percent, place_text
+from .words import STANDING, band_text, place_text
 
 AT_THE_FLOOR = 1.1
 """An error up to this many times its floor counts as noise."""
 NEGLIGIBLE = 1e-6
 """Errors below this are negligible [rad]."""
 MOST_PLACES = 3
+_CONSTANT, _STANDING = 0.75, 0.5
+"""An error is called nearly constant where its mean holds this part of its square, and one at standstill where that
+does: plainer than any region."""
+CONSTANT = "constant"
+"""Stands in place of a dimension where the mean holds the error."""
 _OVERLAP = 0.5
 _COARSE = ("recording", "time")
 """Say which data, not what is wrong: named after everything else."""
@@ -47,7 +52,7 @@ class Place:
     share: float
     """Of the joint's squared error above the floor."""
     base: float
-    """Of the time; of a frequency band, of the octaves."""
+    """Of the time; of a frequency band, of the octaves; 0 of a constant."""
     weight: float
     """Squared error that is there beyond its share of the time, mean over all samples [rad²]."""
     mask: np.ndarray | None
@@ -56,6 +61,8 @@ class Place:
     @property
     def sentence(self) -> str:
         """For a person."""
+        if self.by == (CONSTANT,):
+            return f"{self.joint}: {self.text}"
         of = "of the band, in octaves" if self.by == ("frequency",) else "of the time"
         return (
             f"{self.joint}: {percent(self.share)} of the remaining error lies {self.text} ({percent(self.base)} {of})."
@@ -70,6 +77,7 @@ def places_of(
     layouts: Sequence[Layout],
     bands: tuple[np.ndarray, np.ndarray, np.ndarray],
     recordings: Sequence[str],
+    joint_type: JointType = "hinge",
 ) -> list[Place]:
     """A joint's places, each in other dimensions than the ones before; empty where the error is spread evenly.
 
@@ -77,9 +85,13 @@ def places_of(
         error: All recordings', (K,) [rad].
         floor: σ at each sample, (K,) [rad].
         bands: Edges (B + 1,) [Hz], and shares (B,) of the octaves and of the error above the floor.
+        recordings: Their names.
+        joint_type: Whether the joint turns or slides.
     """
     above = error**2 - floor**2
     total = max(float(above.mean()), 0.0)
+    if plain := _plain(joint, error, above, dimensions, joint_type):
+        return [plain]
     candidates: list[tuple[float, Place]] = []
     for dimension, layout in zip(dimensions, layouts, strict=True):
         region = best_region(layout.time, layout.error, dimension.neighbours)
@@ -112,6 +124,30 @@ def places_of(
         if all(_differ(place, other, above) for other in chosen):
             chosen.append(place)
     return chosen[:MOST_PLACES]
+
+
+def _plain(
+    joint: str, error: np.ndarray, above: np.ndarray, dimensions: Sequence[Dimension], joint_type: JointType
+) -> Place | None:
+    """What says more than any place: the error is nearly constant, or is there while the joint stands still."""
+    total, mean = float(above.mean()), float(error.mean())
+    if total <= 0:
+        return None
+    still = next((d.bin == 0 for d in dimensions if d.name == "speed"), np.zeros(len(error), dtype=bool))
+    size = position_text(mean, [joint_type]).replace("-", "−")
+    constant = (
+        f"the error is nearly constant, {size} (simulated less measured): a torque, a friction or an encoder bias is "
+        "missing."
+    )
+    at_rest = float(above[still].sum()) / (total * len(error))
+    for by, text, least, share, base, mask in (
+        (CONSTANT, constant, _CONSTANT, mean**2 / total, 0.0, None),
+        ("speed", STANDING, _STANDING, at_rest, float(still.mean()), still),
+    ):
+        if share >= least and share > base:
+            share = min(share, 1.0)
+            return Place(joint=joint, by=(by,), text=text, share=share, base=base, weight=total * share, mask=mask)
+    return None
 
 
 def worst_places(places: Sequence[Sequence[Place]]) -> list[Place]:

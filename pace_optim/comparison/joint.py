@@ -261,7 +261,9 @@ def compare_joint(joint: str, j: int, tracks: Sequence[Track], joint_type: Joint
     octaves = _octaves(edges, pooled)
     in_bands = _shares(pooled["above"])
     total, floor = rms(error) or 0.0, rms(sigma) or 0.0
-    places = places_of(joint, error, sigma, dimensions, layouts, (edges, octaves, in_bands), [t.name for t in tracks])
+    places = places_of(
+        joint, error, sigma, dimensions, layouts, (edges, octaves, in_bands), [t.name for t in tracks], joint_type
+    )
     sentence = joint_sentence(joint, total, floor, places, joint_type)
     told = places if places and sentence == places[0].sentence else []
     content: dict[str, Any] = {

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from pace_actuators.text import short_duration
+from pace_actuators.text import percent, short_duration
 
 from .dimensions import SWING, Dimension
 from .regions import Region
 
+STANDING = "where the joint stands still"
 _OF = {
     "velocity": "at velocities ",
     "acceleration": "at accelerations ",
@@ -28,6 +29,8 @@ def place_text(dimension: Dimension, region: Region, recordings: Sequence[str] =
     """
     low = dimension.edges[region.first] if region.first > 0 else None
     high = dimension.edges[region.last + 1] if region.last + 1 < dimension.num_bins else None
+    if dimension.name == "speed" and region.first == region.last == 0:
+        return STANDING
     if dimension.name == "recording":
         return f"in the recording {recordings[region.first]}"
     if dimension.name == "direction":
@@ -51,11 +54,6 @@ def band_text(low: float, high: float, nyquist: float) -> str:
     return _between(
         float(f"{low:.2g}") if low > 0 else None, float(f"{high:.2g}") if high < 0.999 * nyquist else None, "Hz"
     )
-
-
-def percent(share: float) -> str:
-    """A share as "61 %"."""
-    return f"{100 * share:.0f} %" if share >= 0.01 or share <= 0 else "less than 1 %"
 
 
 def _between(low: float | None, high: float | None, unit: str, above: str = "above", below: str = "below") -> str:

@@ -42,8 +42,8 @@ def diagnose(
     Args:
         settings: What to diagnose, and how.
         progress: Shows how far it is.
-        on_verdict: Gets the diagnosis as soon as it is written, before the robot is fitted with what was found. An
-            interruption ends that fit and nothing else.
+        on_verdict: Gets the diagnosis where a fit of the robot with what was found follows, before it. An interruption
+            ends that fit and nothing else.
 
     Raises:
         ValueError: If the run cannot be read, or anything does not fit; nothing has been written then.
@@ -85,13 +85,14 @@ def diagnose(
     diagnosis = replace(diagnosis, wall_time_s=time.monotonic() - begin)
     _save(diagnosis, decisions)
     progress.close()
-    on_verdict(diagnosis)
     explains = found.verdict == "effect" or bool(found.free_form)
     refit = explains if settings.refit is None else settings.refit
     refit = refit or (bool(wrong.wrong) and settings.refit is None)
-    for tried in (None if settings.refit is False else found.on_trial, found if refit else None):
-        if tried is None or not (tried.paying or wrong.wrong):
-            continue
+    fitted_with = [None if settings.refit is False else found.on_trial, found if refit else None]
+    to_fit = [each for each in fitted_with if each is not None and (each.paying or wrong.wrong)]
+    if to_fit:
+        on_verdict(diagnosis)
+    for tried in to_fit:
         if (path := _refit(tried, wrong, problem, run, diagnosis, progress)) is None:
             break
         fitted = FitResult.load(path)

@@ -20,7 +20,7 @@ from pace_optim.diagnosis.search.search import add_effects
 from pace_optim.diagnosis.search.state import Outcome, Search
 from pace_optim.diagnosis.selection.decisions import Log, unlogged
 from pace_optim.diagnosis.verdict.free_curves import Curves, fit_curves, take_curves
-from pace_optim.diagnosis.verdict.names import earned_names, new_effects, shares_of
+from pace_optim.diagnosis.verdict.names import beside_curves, earned_names, new_effects, shares_of
 from pace_optim.diagnosis.verdict.verdict import part_explained, verdict
 from pace_optim.joints.fits.base_fit import fit_base
 from pace_optim.joints.fits.block_errors import check_long_enough
@@ -103,8 +103,8 @@ def search_effects(
     # which of them have earned their names; where none has, a curve
     say("leaving out each effect in turn")
     names = earned_names(fits, outcome, data.floor, log)
-    outcome = pool(fits, names.outcome, log)
-    curves = fit_curves(fits, outcome, data.floor, names.named, say, log)
+    without = pool(fits, names.outcome, log)
+    curves = fit_curves(fits, without, data.floor, names.named, say, log)
 
     def findings(outcome: Outcome, named: torch.Tensor, curves: Curves | None = None) -> Findings:
         decision, outcome = verdict(outcome, data.floor, named)
@@ -120,12 +120,12 @@ def search_effects(
             explained=part_explained(outcome, data.floor),
             shares=shares,
             named={each: names.evidence[each] for each in pairs},
-            hints=names.hints,
+            hints=[*names.hints, *([] if curves is None else beside_curves(without, names, curves.instead))],
             curves=curves,
         )
 
-    found = findings(take_curves(outcome, curves), names.named, curves)
+    found = findings(take_curves(without, curves), names.named, curves)
     if not names.hints or problem.joints_stand_alone:
         return found
     hinted = torch.tensor([any(hint.joint == j for hint in names.hints) for j in range(n)])
-    return replace(found, on_trial=replace(findings(outcome, names.named | hinted), hints=()))
+    return replace(found, on_trial=replace(findings(without, names.named | hinted), hints=()))

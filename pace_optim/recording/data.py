@@ -246,6 +246,7 @@ def _has_values(series: np.ndarray | None, num_joints: int) -> np.ndarray:
 
 
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
+_WITH_UNIT = re.compile(rf"({_NUMBER.pattern})(?: [^\W\d][\w/²]*)?")
 
 
 def notes_by_kind(recordings: Sequence[Recording]) -> list[str]:
@@ -260,18 +261,16 @@ def notes_by_kind(recordings: Sequence[Recording]) -> list[str]:
             kinds.setdefault(_NUMBER.sub("#", note), []).append((recording.name, note))
     result = []
     for told in kinds.values():
-        (first, note), names = told[0], dict.fromkeys(name for name, _ in told)
-        if len({text for _, text in told}) == 1:
-            result.append(f"{listed(names, 6)}: {note}")
-        else:
-            others = {name: text for name, text in told if name != first and text != note}
-            numbers = [f"{name}: {', '.join(_other_numbers(note, text))}" for name, text in others.items()]
-            more = f" ({listed(numbers, 3)})" if numbers else ""
-            result.append(f"{first}: {note}{more}")
+        note = told[0][1]
+        alike = listed(dict.fromkeys(name for name, text in told if text == note), 6)
+        others = {name: text for name, text in told if text != note}
+        numbers = [f"{name}: {', '.join(_other_numbers(note, text))}" for name, text in others.items()]
+        more = f" ({'; '.join(numbers[:3])}{f' and {len(numbers) - 3} more' if len(numbers) > 3 else ''})"
+        result.append(f"{alike}: {note}{more if numbers else ''}")
     return result
 
 
 def _other_numbers(note: str, other: str) -> list[str]:
-    """The numbers of a note that differ from those of another."""
-    pairs = zip(_NUMBER.findall(note), _NUMBER.findall(other), strict=True)
-    return [second for first, second in pairs if second != first]
+    """The numbers of a note that differ from those of another, with their units."""
+    pairs = zip(_WITH_UNIT.finditer(note), _WITH_UNIT.finditer(other), strict=True)
+    return [second[0] for first, second in pairs if first[1] != second[1]]

@@ -115,9 +115,10 @@ class RunData:
             raise ValueError(f"{self.folder} holds no compiled model to draw; an older version made it. Fit again.")
         return model
 
-    def worst_first(self) -> list[RecordingData]:
-        """The recordings, those with the largest error first."""
-        return sorted(self.recordings, key=lambda each: -float(np.nan_to_num(each.error).std()))
+    def worst(self, count: int) -> list[RecordingData]:
+        """At most so many recordings, those with the largest error, in their order."""
+        by_error = sorted(self.recordings, key=lambda each: -float(np.nan_to_num(each.error).std()))
+        return [each for each in self.recordings if each in by_error[:count]]
 
     @contextlib.contextmanager
     def blaming(self, name: str | None) -> Iterator[None]:

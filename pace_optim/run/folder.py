@@ -38,7 +38,8 @@ mean_xxx.pt          mean of the search, or best of the refinement, after iterat
 config.pt            joints, bounds and layout of the parameter vector, and the recordings
 history.json         scores over iterations
 comparison.json      where the model fails, once {compare} was run
-diagnosis.json       which physical effect is missing, once {diagnose} was run
+diagnosis.json       which physical effect is missing, once {diagnose} was run; decisions.jsonl: each choice
+consistency.json     values of each recording alone; with several recordings, near the noise
 events.out.*         TensorBoard: tensorboard --logdir {folder}
 model.mjb            the compiled model (mujoco.MjModel.from_binary_path)
 settings.json, checkpoint.npz   what `{fit} --resume {folder}` needs

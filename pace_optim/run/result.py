@@ -13,9 +13,11 @@ import torch
 
 from pace_actuators import match_names, resolve_joint_values
 from pace_actuators.drive_result import ALL, CURE, DriveResult, LinkInertia
+from pace_actuators.effects import EffectCfg
+from pace_actuators.effects.free_form import FreeForm
 from pace_actuators.files import refuse, write_json
 from pace_actuators.identified import DRIVE_FIELDS, LIMITS, RATE_FLAGS
-from pace_actuators.joint_units import JointType
+from pace_actuators.joint_units import JointType, units_for
 from pace_envs.link_inertia import NAMES
 from pace_envs.tasks.pace import TORQUE_OFFSET, TORQUE_SCALE
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty
@@ -75,6 +77,9 @@ class FitResult(DriveResult):
     """Standard deviation of noise in the torques, by joint [N m]: their spectrum above the motion."""
     imu_delays: dict[str, float] = field(default_factory=dict)
     """How much later than encoders the IMU of a base that moves is read, by recording [s]: the fit reads it earlier."""
+    curves: dict[str, dict[str, dict[str, Any]]] = field(default_factory=dict)
+    """Of effects that are curves, by effect and joint: ``variable`` and ``value`` with their units, the knots ``at``,
+    and the ``torque`` there, of a friction all friction that the joint has."""
     file_values: dict[str, dict[str, float]] = field(default_factory=dict)
     """What the model file states of parameters of links, shaped as these."""
     warnings: list[str] = field(default_factory=list)
@@ -247,6 +252,26 @@ def _file_values(problem: Problem) -> dict[str, dict[str, float]]:
     }
 
 
+def _curves(problem: Problem, values: dict[str, dict[str, float]]) -> dict[str, dict[str, dict[str, Any]]]:
+    """The knots of effects that are curves, by effect and joint."""
+    result: dict[str, dict[str, dict[str, Any]]] = {}
+    for cfg in map(EffectCfg.parse, problem.effects):
+        effect = cfg.effect_class
+        if not issubclass(effect, FreeForm):
+            continue
+        for joint in cfg.joints(problem.joint_names):
+            own = {p.name: values[f"{effect.name}.{p.name}"] for p in effect.parameters}
+            at_joint = {name: each.get(joint, each.get(ALL, 0.0)) for name, each in own.items()}
+            friction = (values.get(name, {}).get(joint, 0.0) for name in ("friction", "viscous_friction"))
+            types = [problem.joint_types[problem.joint_names.index(joint)]]
+            units = {
+                "variable": units_for(f"{effect.variable} [{effect.parameters[-1].unit}]", types),
+                "value": units_for(f"{effect.kind} [{effect.parameters[0].unit}]", types),
+            }
+            result.setdefault(effect.name, {})[joint] = units | effect.law(at_joint, *friction)
+    return result
+
+
 def make_result(
     problem: Problem,
     x: torch.Tensor,
@@ -304,6 +329,7 @@ def make_result(
         notes=assumptions(problem),
         links=_found_links(problem, values),
         file_values=_file_values(problem),
+        curves=_curves(problem, values),
         drive=drive_in_force(problem) | identified_limits(problem.unknown, values, open_),
         command_timing=command_timing(each.logged for each in data.recordings if each.logged is not None),
         **facts,

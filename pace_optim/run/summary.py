@@ -38,7 +38,8 @@ def summary(result: FitResult) -> list[str]:
         lines.append(f"±: one standard deviation, which includes noise, {step}{rate}")
     lines.append(f"{error_line(result)}; {units_for(f'score {result.score:.3e} rad²', result.joint_types)}")
     if result.times_noise and not result.std_means_nothing:
-        lines.append(f"training error: {result.times_noise:.3g} times the measurement noise")
+        said = above_noise(result) or f"{result.times_noise:.3g} times the measurement noise"
+        lines.append(f"training error: {said}")
     if result.torque_noise:
         lines.append(f"error of torques: {', '.join(_torque_errors(result))} (train / validation)")
     if result.objective:
@@ -53,26 +54,32 @@ def summary(result: FitResult) -> list[str]:
     return lines + ["meaning and cure of each code: docs/faq.md"] * any("[W" in warning for warning in result.warnings)
 
 
+def above_noise(result: FitResult) -> str:
+    """How far above the noise a fit has ended, where something is missing; else empty."""
+    times = result.times_noise or 0.0
+    return f"{times:.3g} times the measurement noise: something is missing" if times >= ABOVE_NOISE else ""
+
+
 def error_line(result: FitResult, of: str = "error, all joints") -> str:
     """RMSE of all joints in training and validation, under a name."""
     return units_for(f"{of}: {errors_of(result, ALL)} mrad (train / validation)", result.joint_types)
 
 
-def next_line(result: FitResult, folder: Path, *, compared: bool = False) -> list[str]:
-    """The command that comes after a fit, by how far its error is above the noise; none if the noise is unknown.
+def next_lines(result: FitResult, folder: Path, *, diagnosed: bool = False) -> list[str]:
+    """The commands that come after a fit, by how far its error is above the noise; none if the noise is unknown.
 
     Args:
-        compared: Whether the run has been compared with its recordings.
+        diagnosed: Whether that is the end of a diagnosis.
     """
-    if result.times_noise is None:
+    if result.times_noise is None and not diagnosed:
         return []
     run = shlex.quote(str(folder))
-    if result.times_noise < ABOVE_NOISE:
-        fmt, ending = ("cfg", "drives.py") if result.effects else ("mjcf", "identified.xml")  # MJCF has few effects
-        file = shlex.quote(f"{result.robot_name}_{ending}")
-        return [f"next: {command('export')} {run} --format {fmt} --output {file}"]
-    verb = "diagnose" if compared or (result.std_means_nothing and not result.effects) else "compare"
-    return [f"next: {command(verb)} {run}"]
+    fmt, ending = ("cfg", "drives.py") if result.effects else ("mjcf", "identified.xml")  # MJCF has few effects
+    file = shlex.quote(f"{result.robot_name}_{ending}")
+    export = f"next: {command('export')} {run} --format {fmt} --output {file}"
+    if diagnosed:
+        return [*(f"next: {command(verb)} {run}" for verb in ("compare", "replay")), export]
+    return [export] if (result.times_noise or 0.0) < ABOVE_NOISE else [f"next: {command('diagnose')} {run}"]
 
 
 def _torque_errors(result: FitResult) -> list[str]:
@@ -125,7 +132,7 @@ def _links(result: FitResult) -> list[str]:
         for name in result.link_parameters:
             if link in result.parameters[name]:
                 title = f"{name.removeprefix('link_')} [{result.unit_of(name, link)}]".ljust(14)
-                file = f"{result.file_values[name][link]:.5g}".rjust(12)
+                file = f"{result.file_values[name][link]:.4g}".rjust(12)
                 lines.append("  ".join([link.ljust(width), title, file, _value(result, name, link).rjust(26)]))
     return [*lines, ""]
 
@@ -145,7 +152,7 @@ def _value(result: FitResult, name: str, key: str, factor: float = 1.0) -> str:
     mark = " (at bound)" if label in result.at_bound else " (prior)" if label in result.undetermined else ""
     means_nothing = result.std_means_nothing and result.has_error_bar(name, key)
     error = " ± ?" if means_nothing else "" if std is None else f" ± {factor * std:.1g}"
-    return f"{factor * result.parameters[name][key]:.5g}{error}{mark}"
+    return f"{factor * result.parameters[name][key]:.4g}{error}{mark}"
 
 
 def errors_of(result: FitResult, key: str) -> str:

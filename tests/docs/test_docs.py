@@ -79,7 +79,7 @@ def test_the_tutorial_for_an_own_objective_works_when_typed(warm, tmp_path):
 def test_the_tutorial_for_an_own_effect_works_when_typed(warm, tmp_path):
     printed = type_in(warm, "your_own_effect.md", tmp_path, ROOT, {})
     assert "mrad without the cable" in printed
-    assert "verdict: effect\nMissing: cable_drag. On held-out" in printed
+    assert "verdict: effect\nMissing: cable_drag.\nOn held-out" in printed
 
 
 @pytest.mark.slow

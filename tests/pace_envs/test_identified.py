@@ -21,7 +21,7 @@ from pace_actuators.effects.fading_friction import solver_parameters, step_of_co
 from pace_actuators.identified import draw, labels_with_std
 from pace_actuators.representable import HERE, ISAACLAB, MJLAB, World, check_representable, refuse_inertia
 from pace_envs import ManagerBasedRLEnv, TerrainCfg, load_env_cfg, set_physics_dt
-from pace_envs.identified import doubts, set_identified_step, set_step, use_identified
+from pace_envs.identified import doubts, set_identified_step, set_step, step_note, use_identified
 from pace_envs.rl import RunSettings, load_cfg, train
 from pace_optim.commands.train import _task_for
 from pace_optim.identification.fit import fit
@@ -108,6 +108,20 @@ def test_a_continuous_controller_stays_one(result):
     assert not PaceDCMotorCfg.from_result(result, ".*HAA").implicit
     with pytest.raises(ValueError, match="Put them into separate groups"):
         PaceDCMotorCfg.from_result(result)
+
+
+def test_one_line_tells_at_which_steps_a_training_runs_and_how_it_gets_faster(result):
+    """Two lines named 1 ms and 0.5 ms as the step of the physics."""
+    cfg, drives = load_env_cfg(WALK), IdentifiedDrives.load(result)
+    before, control = cfg.sim.dt, drives.at.control_dt
+    assert step_note(cfg, drives, before) == ""
+    set_identified_step(cfg, drives)
+    steps = "drives 2.5 ms, physics 2.5 ms, as in the fit (task: 5 ms)"
+    assert control == DT and step_note(cfg, drives, before) == steps
+    set_physics_dt(cfg, 0.0005)
+    fine = step_note(cfg, drives, before)
+    assert fine.startswith("drives 2.5 ms, physics 0.5 ms, as in the fit (task: 5 ms). Fine steps are slow")
+    assert "--physics_dt 0.0025 --drive_dt 0.0025" in fine
 
 
 LEGS = ("LF", "RF", "LH", "RH")
@@ -360,7 +374,7 @@ def test_a_training_keeps_its_drives(result, tmp_path, no_export):
     cfg = load_cfg(read)
     assert cfg.scene.robot.actuators["legs"].delay_s == pytest.approx(3.4 * DT) and cfg.sim.dt == DT
     played = run_script("play", "--checkpoint", run, "--num_envs", "2", "--seconds", "0.1", cwd=ROOT)
-    assert played.returncode == 0 and "identified drives: physics and drives run at 2.5 ms" in played.stdout
+    assert played.returncode == 0 and "identified drives: drives 2.5 ms, physics 2.5 ms, as in the fit" in played.stdout
 
 
 def test_a_finer_step_keeps_the_controllers_rate_with_effects_too(result):

@@ -49,11 +49,15 @@ def make_diagnosis(verdict: str = "effect") -> dict[str, Any]:
             "confounded_with": [],
             "screen_score": 0.5,
             "values": {},
+            "tried": {joint: [4.3e-3, after] for joint in JOINTS},
+            "status": "does not pay",
         } | changes
 
+    rivals = ["stribeck_friction", "presliding_friction"]
+    states = [{"significant": known, "status": status} for status in ("added", "as good")]
     ranking = [
-        entry("stribeck_friction", 4e-4, added=known, significant=known, confounded_with=["presliding_friction"]),
-        entry("presliding_friction", 4.2e-4, significant=known, confounded_with=["stribeck_friction"]),
+        entry(rivals[0], 4e-4, added=known, confounded_with=rivals[1:], **states[0]),
+        entry(rivals[1], 4.2e-4, confounded_with=rivals[:1], **states[1]),
         entry("quadratic_friction", 3.9e-3, joints=["knee"]),
     ]
     explained = {"torque_over_position": 0.2, "friction_over_position": 0.8, "torque_over_time": -0.1}

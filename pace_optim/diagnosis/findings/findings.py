@@ -15,7 +15,7 @@ from pace_actuators.drive_result import ALL
 from pace_actuators.effects import Effect, EffectCfg, get_effect
 from pace_actuators.files import json_text
 from pace_actuators.joint_units import units_for
-from pace_actuators.text import conjoined, size_text
+from pace_actuators.text import conjoined, percent, size_text
 from pace_optim.diagnosis.checks.data_check import DataCheck
 from pace_optim.diagnosis.findings.advice import advise
 from pace_optim.diagnosis.findings.result import Diagnosis
@@ -34,9 +34,6 @@ from pace_optim.problem.problem import Problem
 from pace_optim.run.result import FitResult
 from pace_optim.run.settings import FitSettings, command_line
 
-_LEAST_TOLD = 0.1
-"""Smaller shares are printed as below this [%]."""
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Findings:
@@ -54,8 +51,8 @@ class Findings:
     """How much of what the effects found explain is due to each, the largest first."""
     named: Evidences = field(default_factory=dict)
     """Effects that are what is missing, on each joint with the evidence of that joint."""
-    refitted: bool = False
-    """Whether errors and sizes are those of the whole robot's fit."""
+    trained: torch.Tensor | None = None
+    """Training RMSE of each joint in the whole robot's fit, (n,) [rad]; ``None``: each joint was simulated alone."""
     hints: Sequence[Hint] = ()
     """Effects that lower the error of joints and have not earned their names."""
     curves: Curves | None = None
@@ -63,6 +60,11 @@ class Findings:
     on_trial: Findings | None = None
     """The same with the hinted effects as if they were named: the fit of the whole robot may show that they are. Joints
     that move each other, each simulated alone beside others that are still wrong, may not."""
+
+    @property
+    def refitted(self) -> bool:
+        """Whether errors and sizes are those of the whole robot's fit."""
+        return self.trained is not None
 
     @property
     def paying(self) -> list[str]:
@@ -132,7 +134,7 @@ def told(
             *advise(problem, found.outcome, found.verdict, found.data, found.absorbed),
         ],
         runs=[str(folder)],
-        tried=[effect.name for effect in candidates],
+        tried=[e.name for e in candidates if bool(found.outcome.base.model.allowed_joints(e).any())],
         physics_dt=problem.physics_dt,
         error_map=error_map(
             found.curves,
@@ -176,10 +178,15 @@ def with_refit(
     steps = zip(judged["ladder"], (before, after), paths, strict=True)
     ladder_of_runs = [step | {"validation_rmse": rmse, "run": path} for step, rmse, path in steps]
     unsure = without_error_bars(found.outcome, found.data.floor).tolist()
+    curves = {joint: own for by_joint in refit.curves.values() for joint, own in by_joint.items()}
     return replace(
         diagnosis,
-        **judged | {"summary": f"{judged['summary']} {fall}", "ladder": ladder_of_runs},
+        **judged | {"evidence": [*judged["evidence"], fall], "ladder": ladder_of_runs},
         sizes=[_as_refitted(size, refit, unsure[names.index(size["joint"])]) for size in diagnosis.sizes],
+        error_map={
+            joint: each | ({"curve": {key: curves[joint][key] for key in ("at", "torque")}} if joint in curves else {})
+            for joint, each in diagnosis.error_map.items()
+        },
         runs=paths,
     )
 
@@ -201,7 +208,7 @@ def as_refitted(found: Findings, run: FitResult, refit: FitResult) -> Findings:
         hints=[*found.hints, *hints],
         verdict=verdict(restricted(outcome, ~needs_none), floor, with_name)[0],
         explained=part_explained(outcome, floor),
-        refitted=True,
+        trained=torch.tensor([refit.rmse["train"][name] for name in names], dtype=torch.float64),
     )
 
 
@@ -212,7 +219,9 @@ def _judged(found: Findings, wrong: LinkFindings, problem: Problem) -> dict[str,
     outcome = replace(found.outcome, final=replace(found.outcome.final, model=found.model))
     return {
         "verdict": "link" if only_links else found.verdict,
-        "summary": " ".join([*said, *([] if only_links else [summary_of(found, problem)])]),
+        "summary": " ".join([*said, *([] if only_links else [verdict_of(found, problem)])]),
+        "evidence": [] if only_links else evidence_of(found, problem),
+        "more": more_missing(found, problem),
         "explained": found.explained,
         "added": found.added,
         "hints": [asdict(hint) | {"joint": problem.joint_names[hint.joint]} for hint in found.hints],
@@ -271,39 +280,48 @@ def _about_run(found: Findings, problem: Problem, run: FitResult) -> list[str]:
     ]
 
 
-def summary_of(found: Findings, problem: Problem) -> str:
-    """The verdict in a few sentences."""
+def verdict_of(found: Findings, problem: Problem) -> str:
+    """What is missing, and where more is, in a sentence or two."""
+    if found.verdict == "nothing_missing":
+        return "Nothing is missing that these recordings could show."
+    none = "Something is missing, and no known effect has earned its name."
+    said = [_missing(found) if found.verdict == "effect" else none]
+    if more := more_missing(found, problem):
+        said.append(f"More is missing on {conjoined(f'{joint} ({left})' for joint, left in more.items())}.")
+    return " ".join(said)
+
+
+def evidence_of(found: Findings, problem: Problem) -> list[str]:
+    """The errors behind the verdict, and what comes nearest where no effect has earned its name."""
     unit = units_for("mrad", problem.joint_types)
     before = 1e3 * float(found.outcome.base_errors.mse.mean().sqrt())
     alone = "" if len(problem.joint_names) == 1 or found.refitted else ", with each joint simulated alone"
     floor = 1e3 * float(found.data.floor.square().mean().sqrt())
-    if found.verdict == "nothing_missing":
-        return (
-            f"Nothing is missing that these recordings could show: the validation error is {before:.3g} {unit}, the "
-            f"floor of noise and numerics {floor:.3g} {unit}{alone}."
-        )
-    if found.verdict == "unknown":
-        text = (
-            f"Something is missing, and no known effect has earned its name: the validation error is {before:.3g} "
-            f"{unit}, the floor {floor:.3g} {unit}{alone}."
-        )
-        if found.paying:
-            what = "A curve" if len(found.free_form) == len(found.paying) else "What lowers it"
-            part = 100 * max(0.0, found.explained)
-            text += f" {what}, {', '.join(found.paying)}, explains {part:.0f} % of what lies between."
-        return " ".join([text, *hint_sentences(found.hints, problem.joint_names)])
-    what = "all of it" if found.free_form else "it"
-    far = found.outcome.far(found.data.floor).tolist()
-    percent = f"{100 * found.explained:.0f}"
-    percent = "over 99" if any(far) and percent == "100" else percent
-    summary = (
-        f"{_missing(found)} On held-out recordings {what} explains {percent} % of what lies above the floor "
-        f"({floor:.3g} {unit})."
-    )
-    if any(far) and not found.free_form:
-        where = conjoined(name for name, is_far in zip(problem.joint_names, far, strict=True) if is_far)
-        summary += f" Something else is missing on {where} too, which no known effect explains."
-    return " ".join([summary, *hint_sentences(found.hints, problem.joint_names)])
+    explained, hints = percent(max(0.0, found.explained)), hint_sentences(found.hints, problem.joint_names)
+    if found.verdict == "effect":
+        what = "all of it" if found.free_form else "it"
+        return [
+            f"On held-out recordings {what} explains {explained} of what lies above the floor ({floor:.3g} {unit}).",
+            *hints,
+        ]
+    said = [f"The validation error is {before:.3g} {unit}, the floor of noise and numerics {floor:.3g} {unit}{alone}."]
+    if found.verdict == "unknown" and found.paying:
+        what = "A curve" if len(found.free_form) == len(found.paying) else "What lowers it"
+        said.append(f"{what}, {', '.join(found.paying)}, explains {explained} of what lies between.")
+    return [*said, *(hints if found.verdict == "unknown" else [])]
+
+
+def more_missing(found: Findings, problem: Problem) -> dict[str, str]:
+    """Joints that end far from their floor in validation or in training, with what is left: "0.54 mrad, 5 floors"."""
+    result, far = {}, found.outcome.cfg.judging.far
+    parts = [("", found.outcome.final_errors.mse.sqrt())]
+    parts += [] if found.trained is None else [(" in training", found.trained)]
+    for j, (name, floor) in enumerate(zip(problem.joint_names, found.data.floor.tolist(), strict=True)):
+        for where, rmse in parts:
+            if name not in result and (left := float(rmse[j])) > far * floor:
+                unit = units_for("mrad", [problem.joint_types[j]])
+                result[name] = f"{1e3 * left:.3g} {unit}{where}, {left / floor:.2g} floors"
+    return result
 
 
 def hint_sentences(hints: Sequence[Hint], joint_names: Sequence[str]) -> list[str]:
@@ -318,7 +336,8 @@ def hint_sentences(hints: Sequence[Hint], joint_names: Sequence[str]) -> list[st
         ]
         doubts = [f"{d} ({', '.join(apart)})" if d == DIFFERS and apart else d for d in hint.doubts]
         what = f"{hint.effect} ({sizes})" if sizes else hint.effect
-        said.append(f"Hint on {joint_names[hint.joint]}: {what}. It is not named, as {' and '.join(doubts)}.")
+        part = f" explains {percent(max(0.0, hint.explained))}"
+        said.append(f"Hint on {joint_names[hint.joint]}: {what}{part}. It is not named, as {' and '.join(doubts)}.")
     return said
 
 
@@ -342,25 +361,14 @@ def to_try(found: Findings, run: FitResult, settings: Mapping[str, Any]) -> list
 def _missing(found: Findings) -> str:
     """The effects found; where there are several, what is due to each, and whether one of them stands out."""
     if found.free_form:
-        return (
-            f"Missing: {', '.join(found.added)}. On other joints no known effect explains the error; a curve takes its "
-            f"place: {', '.join(found.free_form)}."
-        )
+        return f"Missing: {', '.join(found.added)}. Covered by a curve, without a name: {', '.join(found.free_form)}."
     if len(found.added) < 2:
         return f"Missing: {found.added[0]}."
     shares = found.shares_named.values()
-    parts = [f"{label} ({percent_text(s)} %)" for label, s in zip(found.added, shares, strict=True)]
+    parts = [f"{label} ({percent(s)})" for label, s in zip(found.added, shares, strict=True)]
     if max(shares) >= found.outcome.cfg.verdict.most:
         return f"Missing: {', '.join(parts)}."
     return f"Missing: several effects, none of which dominates: {', '.join(parts)}."
-
-
-def percent_text(share: float) -> str:
-    """A share in percent; one that is small beside another is not nothing."""
-    percent = 100 * share
-    if abs(percent) < _LEAST_TOLD:
-        return f"below {_LEAST_TOLD}"
-    return f"{percent:.0f}" if round(percent) else f"{percent:.1g}"
 
 
 def ladder(found: Findings, wrong: LinkFindings) -> list[dict[str, Any]]:
@@ -379,6 +387,7 @@ def by_joint(found: Findings, problem: Problem) -> dict[str, dict[str, Any]]:
             "type": problem.joint_types[j],
             "validation_rmse_before": float(outcome.base_errors.mse[j].sqrt()),
             "validation_rmse_after": float(outcome.final_errors.mse[j].sqrt()),
+            "training_rmse": None if found.trained is None else float(found.trained[j]),
             "floor": float(found.data.floor[j]),
             "effects": [e.name for e, has in zip(model.effects, model.has, strict=True) if bool(has[j])],
         }

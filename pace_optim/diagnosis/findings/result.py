@@ -25,6 +25,10 @@ class Diagnosis:
     """``link``, ``effect``, ``nothing_missing`` or ``unknown``."""
     summary: str
     """The verdict in a sentence or two."""
+    evidence: list[str] = field(default_factory=list)
+    """The errors behind it, and what comes nearest where no effect has earned its name; a sentence each."""
+    more: dict[str, str] = field(default_factory=dict)
+    """Joints on which more is missing: their error ends far above the floor. How much: "0.54 mrad, 5 floors"."""
     explained: float = 1.0
     """Part of the error above the floor that the effects found explain."""
     added: list[str]
@@ -50,7 +54,7 @@ class Diagnosis:
     likes: dict[str, list[str]] = field(default_factory=dict)
     """Effects that these recordings cannot separate from one found, by its name."""
     joints: dict[str, dict[str, Any]]
-    """For each joint its errors, floor and effects."""
+    """For each joint its errors, floor and effects; ``training_rmse`` is that of the refit."""
     data: list[str]
     """What was noticed about the recordings."""
     absorbed: dict[str, str] = field(default_factory=dict)

@@ -6,29 +6,34 @@ from collections.abc import Sequence
 from typing import Any
 
 from pace_actuators.joint_units import units_for
-from pace_actuators.text import SHOWN, conjoined, listed, shortened, sizes_by_joints
+from pace_actuators.text import SHOWN, conjoined, listed, shortened, sizes_by_joints, three_figures
 from pace_optim.diagnosis.findings.result import Diagnosis
 
 _EFFECTS = 8
 """Effects in the list of what was tried, at most."""
 
 
+def first_line(diagnosis: Diagnosis) -> str:
+    """What is printed of it before the whole robot is fitted with what was found."""
+    found = [*(link["label"] for link in diagnosis.links), *diagnosis.paying]
+    return f"each joint alone: {diagnosis.verdict}, {listed(found)}; the fit of the whole robot decides"
+
+
 def lines_of(diagnosis: Diagnosis) -> list[str]:
-    """What is printed as soon as the verdict is known, the most important first; sizes come with the refit."""
-    lines = [f"verdict: {diagnosis.verdict}", diagnosis.summary]
+    """What is printed of a diagnosis, the most important first."""
+    lines = [f"verdict: {diagnosis.verdict}", diagnosis.summary, *diagnosis.evidence]
     lines += [f"{effect} cannot be separated from {conjoined(likes)}." for effect, likes in diagnosis.likes.items()]
     lines += [f"- {sentence}" for sentence in shortened(diagnosis.advice, "proposal")]
-    names = list(diagnosis.joints)
     if diagnosis.ranking:
-        lines.append("Effects tried, with the validation error of their joints before and after (each joint alone):")
+        unit = units_for("mrad", diagnosis.joint_types(diagnosis.joints))
+        lines.append(f"Effects tried, each joint alone, with its validation error before -> after [{unit}]:")
     for entry in diagnosis.ranking[:_EFFECTS]:
-        before, after = 1e3 * entry["validation_rmse_before"], 1e3 * entry["validation_rmse_after"]
-        mark = "added" if entry["added"] else ("would pay" if entry["significant"] else "does not pay")
-        unit = units_for("mrad", diagnosis.joint_types(entry["joints"]))
-        joints = entry["joints"]
-        where = f"on {listed(joints) if len(joints) <= SHOWN else f'{len(joints)} of {len(names)} joints'}"
-        where = where if len(names) > 1 else ""
-        lines.append(f"  {entry['effect']:26s} {before:8.3f} -> {after:8.3f} {unit}  {mark:13s}  {where}".rstrip())
+        own = [
+            f"{joint} {' -> '.join(three_figures(1e3 * rmse) for rmse in both)}"
+            for joint, both in entry.get("tried", {}).items()
+        ]
+        name = entry["effect"] + (f" (round {entry['round']})" if entry["round"] > 1 else "")
+        lines.append(f"  {name:26s} {entry.get('status', ''):12s}  {listed(own, SHOWN)}")
     return lines + [f"- {sentence}" for sentence in shortened(diagnosis.data, "note")]
 
 

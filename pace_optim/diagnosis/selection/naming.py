@@ -58,6 +58,7 @@ class Evidence:
 
 
 DIFFERS = "its size differs between recordings"
+CURVE_LEAVES_LESS = "a curve leaves less than half of its error"
 
 
 def doubts(evidence: Evidence, *, cfg: DiagnosisCfg = DEFAULT) -> list[str]:
@@ -73,7 +74,7 @@ def doubts(evidence: Evidence, *, cfg: DiagnosisCfg = DEFAULT) -> list[str]:
     if (evidence.larger or evidence.slight) and evidence.without <= near:
         return ["the error is near the floor without it"]
     if evidence.explained < 0.5:
-        return [f"it explains {100 * max(0.0, evidence.explained):.0f} % of what lies above the floor"]
+        return ["it leaves more than it explains"]
     far = evidence.left > near
     return [
         *(["its size is not significant"] if evidence.bars < SURE and (far or evidence.bars > 0) else []),

@@ -12,6 +12,7 @@ import torch
 from pace_actuators.effects import available_effects, get_effect
 from pace_actuators.effects.free_form import FreeForm
 from pace_actuators.joint_units import JointType, units_for
+from pace_actuators.text import percent
 from pace_optim.diagnosis.checks.stated_facts import unlogged_effects
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, JudgingCfg
 from pace_optim.diagnosis.search.state import Outcome
@@ -166,7 +167,7 @@ _NONE = "no curve over a single variable carries the error."
 
 def _sentence(effect: type[FreeForm], part: float, before: float, after: float, formula: str) -> str:
     return (
-        f"a curve of {effect.kind} over {effect.variable} explains {100 * part:.0f} % of the squared error above the "
+        f"a curve of {effect.kind} over {effect.variable} explains {percent(part)} of the squared error above the "
         f"floor ({before:.3g} to {after:.3g} mrad)." + (f" It is smooth: {formula}." if formula else "")
     )
 
@@ -224,14 +225,8 @@ def _curve(fitted: Fitted, effect: type[FreeForm], joint: int) -> dict[str, list
     """
     physical = fitted.physical[joint]
     names = [p.name for p in effect.parameters]
-    curve = effect.curve(dict(zip(names, physical[fitted.model.columns(effect)].tolist(), strict=True)))
-    if effect.kind == "friction" and effect.parameters[0].unit == "N m":
-        # the base model and the curve share a part that cannot be separated everywhere
-        level, viscous = (float(physical[COLUMN[name]]) for name in ("friction", "viscous_friction"))
-        slope = viscous if effect.variable == "speed" else 0.0
-        total = (max(0.0, level + more) for more in curve["torque"])
-        curve["torque"] = [each + slope * x for each, x in zip(total, curve["at"], strict=True)]
-    return curve
+    values = dict(zip(names, physical[fitted.model.columns(effect)].tolist(), strict=True))
+    return effect.law(values, *(float(physical[COLUMN[name]]) for name in ("friction", "viscous_friction")))
 
 
 def _start(base: Fitted, effect: type[FreeForm], joints: torch.Tensor, seen: torch.Tensor) -> Fitted:

@@ -11,7 +11,7 @@ import torch
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.selection.decisions import Log, unlogged
-from pace_optim.diagnosis.selection.naming import Evidence, doubts
+from pace_optim.diagnosis.selection.naming import CURVE_LEAVES_LESS, Evidence, doubts
 from pace_optim.diagnosis.selection.rules import decide
 from pace_optim.diagnosis.selection.size_consistency import sizes_apart, unevenness
 from pace_optim.diagnosis.verdict.sizes import error_bars_from_none, factor_of, standard_deviations
@@ -272,6 +272,7 @@ def hint(
     outcome: Outcome,
     now: Fitted,
     std: torch.Tensor | None = None,
+    doubted: Sequence[str] = (),
 ) -> Hint:
     """An effect of a joint with its size and what speaks against its name.
 
@@ -282,6 +283,7 @@ def hint(
         outcome: Where the search ended.
         now: The model that has it.
         std: Physical standard deviations, (n, P), zero without error bar; ``None``: from its Jacobian.
+        doubted: What speaks against it beside its evidence.
     """
     own, columns = as_judged(effect, evidence)[joint], now.model.columns(effect)
     if std is None:
@@ -301,5 +303,23 @@ def hint(
             zip(effect.parameters, now.physical[joint, columns].tolist(), std[joint, columns].tolist(), strict=True)
         )
     ]
-    doubted = doubts(own, cfg=outcome.cfg)
-    return Hint(effect=effect.name, joint=joint, explained=own.explained, doubts=doubted, sizes=sizes)
+    against = [*doubts(own, cfg=outcome.cfg), *doubted]
+    return Hint(effect=effect.name, joint=joint, explained=own.explained, doubts=against, sizes=sizes)
+
+
+def beside_curves(outcome: Outcome, names: Names, covered: torch.Tensor) -> list[Hint]:
+    """On each joint where a curve takes the place of named effects, the one that explains most, as a hint.
+
+    Args:
+        outcome: With the effects that are named.
+        names: What is named.
+        covered: Joints where a curve takes their place, (n,) bool.
+    """
+    result = []
+    for j in (covered & names.named).nonzero()[:, 0].tolist():
+        here = {effect: own for (effect, joint), own in names.evidence.items() if joint == j}
+        has = [e for e, own in zip(outcome.final.model.effects, outcome.final.model.has, strict=True) if bool(own[j])]
+        if nearest := max((e for e in has if e in here), key=lambda e: here[e].explained, default=None):
+            evidence = {joint: own for (effect, joint), own in names.evidence.items() if effect is nearest}
+            result.append(hint(nearest, j, evidence, outcome, outcome.final, doubted=[CURVE_LEAVES_LESS]))
+    return result

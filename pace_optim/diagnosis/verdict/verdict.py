@@ -13,7 +13,7 @@ from pace_actuators.effects import Effect
 from pace_actuators.joint_units import JointType, all_hinges, units_for
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.selection.candidate_results import Round, Trial
-from pace_optim.diagnosis.selection.comparison import least_ratio
+from pace_optim.diagnosis.selection.comparison import least_ratio, within
 from pace_optim.diagnosis.verdict.names import above_floor, curves_in, new_effects
 from pace_optim.joints.fits.fitted import Fitted
 
@@ -124,11 +124,31 @@ def ranking(
                 "added": bool(added) and decision == "effect",
                 **_told(this, effect, added, joint_names, types, least_ratio(depth == 0, cfg=outcome.cfg.judging)),
             }
+            entry["status"] = "added" if entry["added"] else _status(this, effect, outcome)
             is_best = any(own and own[0].effect is effect for own in this.trials)
             ratio = entry["validation_rmse_before"] / max(entry["validation_rmse_after"], 1e-12)
             place = places.get(effect.name, len(places)) if added else 0
             entries.append(((not added, place, depth, not is_best, -ratio), entry))
     return [entry for _, entry in sorted(entries, key=lambda each: each[0])]
+
+
+def _status(this: Round, effect: type[Effect], outcome: Outcome) -> str:
+    """What an effect that was not added is worth beside what its joints have in the end."""
+    found = {"does not pay"}
+    for j, trials in enumerate(this.trials):
+        best = min([float(outcome.final_errors.mse[j]), *(t.mse_after for t in trials if t.effect is this.chosen[j])])
+        for trial in (t for t in trials if t.effect is effect and t.significant):
+            alike = outcome.cfg.judging.alike
+            if not within(best, trial.mse_after, alike):
+                found.add("would pay")
+            else:
+                found.add("as good" if within(trial.mse_after, best, alike) else "leaves more")
+    return next(each for each in STATUS if each in found)
+
+
+STATUS = ("would pay", "as good", "leaves more", "does not pay")
+"""Of an effect that was not added, on the joint where it is worth most: with the model that the joint has in the end it
+would lower the error further, leaves as much, leaves more, or does not lower the error enough."""
 
 
 def _told(
@@ -156,6 +176,10 @@ def _told(
         "confounded_with": sorted(confounded),
         "screen_score": max(t.screen_score for t in own),
         "values": {joint_names[t.joint]: t.values for t in shown},
+        "tried": {
+            joint_names[t.joint]: [t.mse_before**0.5, t.mse_after**0.5]
+            for t in sorted(own, key=lambda t: -t.mse_before)
+        },
     }
 
 

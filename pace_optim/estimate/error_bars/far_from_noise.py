@@ -59,6 +59,5 @@ def far_end(times: float | None, rmse: float, optimizer: str, joint_types: Seque
     unit = units_for("mrad", joint_types)
     return [
         f"The error of {1e3 * rmse:.3g} {unit} is {times:,.0f} times the measurement noise: the values make up for "
-        f"something else, and error bars mean nothing. First check gains, torque limits and loads.{search} "
-        f"Then {command('diagnose')} looks for the missing physics. [W1]"
+        f"something else, and error bars mean nothing. First check gains, torque limits and loads.{search} [W1]"
     ]

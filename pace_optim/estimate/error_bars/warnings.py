@@ -62,7 +62,7 @@ def fit_warnings(
         *_overfit(rmse, change, problem.joint_types),
         *_sampled_commands(problem, physical, rmse, uncertainty),
         *_critical_delays(problem, physical),
-        *_at_bounds(problem, physical, uncertainty),
+        *_at_bounds(problem, physical, rmse, uncertainty),
         *_undetermined(problem, physical, left_open),
         *_unsure(unsure),
         *_alike(uncertainty.indistinguishable),
@@ -134,7 +134,7 @@ def _of_links(labels: Sequence[str]) -> list[str]:
 def _alike(groups: Sequence[tuple[str, ...]]) -> list[str]:
     """Confounded parameters, with the joints."""
     kinds: dict[tuple[str, ...], list[str]] = {}
-    for group in groups:
+    for group in (own for own in groups if not any(set(own) < set(other) for other in groups)):
         keys = {label.split("/", 1)[1] for label in group} - {GLOBAL}
         kind = tuple(label.split("/")[0] for label in group) if len(keys) == 1 else group
         kinds.setdefault(kind, []).extend(sorted(keys) if len(keys) == 1 else [])
@@ -144,7 +144,7 @@ def _alike(groups: Sequence[tuple[str, ...]]) -> list[str]:
     ]
     if not found:
         return []
-    return [f"These recordings cannot separate {'; '.join(found)}. Move more, or in other poses. [W12]"]
+    return [f"These recordings cannot separate {'; '.join(found)}. Move these joints more, or in other poses. [W12]"]
 
 
 def _by_parameter(labels: Sequence[str]) -> dict[str, list[str]]:
@@ -179,6 +179,11 @@ def _overfit(rmse: dict[str, dict[str, float]], change: float, joint_types: Sequ
     ]
 
 
+def _is_far(problem: Problem, rmse: dict[str, dict[str, float]]) -> bool:
+    """Whether the fit ended far above the noise [W1]."""
+    return (times_noise(problem, rmse["train"].get(ALL)) or 0.0) >= FAR_ABOVE_NOISE
+
+
 def _sampled_commands(
     problem: Problem, physical: torch.Tensor, rmse: dict[str, dict[str, float]], uncertainty: Uncertainty
 ) -> list[str]:
@@ -191,7 +196,7 @@ def _sampled_commands(
     of_delay = problem.space["delay"]
     low, high, delay = (float(each[of_delay]) for each in (problem.space.lower, problem.space.upper, physical))
     at_bound = f"delay/{GLOBAL}" in uncertainty.at_bound and low == 0 and delay < high / 2
-    if slowest == 1 or not at_bound or (times_noise(problem, rmse["train"].get(ALL)) or 0.0) < FAR_ABOVE_NOISE:
+    if slowest == 1 or not at_bound or not _is_far(problem, rmse):
         return []
     return [
         f"Commands are logged with the samples, every {1e3 * slowest * problem.control_dt:g} ms, and held in between. "
@@ -232,7 +237,9 @@ def _coarse_step(problem: Problem, rmse: dict[str, dict[str, float]], change: fl
     ]
 
 
-def _at_bounds(problem: Problem, physical: torch.Tensor, uncertainty: Uncertainty) -> list[str]:
+def _at_bounds(
+    problem: Problem, physical: torch.Tensor, rmse: dict[str, dict[str, float]], uncertainty: Uncertainty
+) -> list[str]:
     """Parameters with the side, the bound and the joints."""
     space = problem.space
     low, high, values = space.lower.tolist(), space.upper.tolist(), physical.tolist()
@@ -248,10 +255,8 @@ def _at_bounds(problem: Problem, physical: torch.Tensor, uncertainty: Uncertaint
         f"{name.replace('_', ' ')} ({side}, {_bound(problem, name, bound, keys[0])}){_of(keys)}"
         for (name, side, bound), keys in places.items()
     ]
-    return [
-        f"At a bound: {'; '.join(found)}. Find the missing physics that the value stands in for, or widen the bound. "
-        "[W9]"
-    ]
+    or_widen = "" if _is_far(problem, rmse) else ", or widen the bound"
+    return [f"At a bound: {'; '.join(found)}. Find the missing physics that the value stands in for{or_widen}. [W9]"]
 
 
 def _bound(problem: Problem, name: str, bound: float, key: str) -> str:

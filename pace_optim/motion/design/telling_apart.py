@@ -111,7 +111,9 @@ def next_experiments(
         left = [pair for pair in left if pair not in [each.pair for each in best]]
     for pair in left:
         count = sum(each.pair is pair for each in predictions)
-        text = f"These recordings cannot separate {_named(pair, problem)}. Nor would any of {count} others tried."
+        text = (
+            f"These recordings cannot separate {_named(pair, problem)}. Nor would any of {count} simulated recordings."
+        )
         result.append(f"{text} {pair.hint}".rstrip())
     return result
 

@@ -8,11 +8,12 @@ from typing import Any
 
 from markupsafe import Markup
 
-from pace_actuators.joint_units import JointType, joint_label, units_for
-from pace_actuators.text import in_words, listed, sizes_by_joints, three_figures
+from pace_actuators.joint_units import JointType, units_for
+from pace_actuators.text import in_words, percent, three_figures
 
 from ..markup import Section, bold, bullets, figure, html, joined, table
 from ..run_data import RunData
+from .parameters import knots_table
 
 _SHOWN = 10
 """Effects in the chart, at most."""
@@ -27,11 +28,9 @@ def diagnosis(run: RunData) -> Section | None:
     if not content:
         return None
     parts = [
-        _sizes(content),
         _ladder(content),
         _error_map(content),
         _ranking(content),
-        _joints(content),
     ]
     parts += [_advice(content), _data(content)]
     return Section(id="diagnosis", title="Diagnosis", html=joined(parts))
@@ -51,23 +50,6 @@ def _types(content: dict[str, Any], joints: Iterable[str]) -> list[JointType]:
 def _unit(content: dict[str, Any]) -> str:
     """Of the errors of all joints."""
     return units_for("mrad", _types(content, content["joints"]))
-
-
-def _sizes(content: dict[str, Any]) -> Markup:
-    """How large what was found is."""
-    sizes = sizes_by_joints(content.get("sizes", []))
-    if not sizes:
-        return Markup("")
-    likes = content.get("likes", {})
-    rows = [
-        [bold(effect), parameter.replace("_", " "), listed(joints), text, ", ".join(likes.get(effect, [])) or "–"]
-        for (effect, parameter, text), joints in sizes.items()
-    ]
-    known = any(size["std"] is not None for size in content["sizes"])
-    size = "size ± standard deviation" if known else "size"
-    about = "" if known else "without error bars: these joints end above their floor, or a value is at its bound"
-    head = ["effect", "parameter", "joints", size, "cannot be separated from"]
-    return _titled("How large it is", table(head, rows), about)
 
 
 def _ladder(content: dict[str, Any]) -> Markup:
@@ -150,40 +132,19 @@ def _chart(entries: list[dict[str, Any]], floor: float, factor: float, unit: str
 def _evidence(entries: list[dict[str, Any]], factor: float, unit: str) -> Markup:
     rows = []
     for entry in entries:
-        state = "added" if entry.get("added") else "would pay" if entry["significant"] else "does not pay"
+        tried = entry.get("tried", {}).items()
+        errors = {joint: " → ".join(three_figures(factor * e) for e in own) for joint, own in tried}
         rows.append(
             [
                 bold(_name(entry)),
-                state,
-                " → ".join(three_figures(factor * entry[f"validation_rmse_{when}"]) for when in ("before", "after")),
-                listed(entry["joints"], 3),
+                entry.get("status", ""),
+                html("{% for joint, text in errors.items() %}{{ joint }}: {{ text }}<br>{% endfor %}", errors=errors),
                 ", ".join(entry["confounded_with"]) or "–",
                 entry["evidence"],
             ]
         )
-    head = ["effect", "", f"validation [{unit}]", "joints", "cannot be separated from", "evidence"]
+    head = ["effect", "", f"validation of each joint [{unit}]", "cannot be separated from", "evidence"]
     return table(head, rows, "evidence")
-
-
-def _joints(content: dict[str, Any]) -> Markup:
-    joints = content["joints"]
-    factor, types = _FACTOR, _types(content, joints)
-    rows = [
-        [
-            bold(joint_label(name, own, types)),
-            *(
-                three_figures(factor * joint[key])
-                for key in ("validation_rmse_before", "validation_rmse_after", "floor")
-            ),
-            ", ".join(joint["effects"]) or "–",
-        ]
-        for (name, joint), own in zip(joints.items(), types, strict=True)
-    ]
-    how = "whole robot" if len(content["runs"]) > 1 else "each joint simulated alone"
-    about = f"{how}, validation error"
-    return _titled(
-        "Joint by joint", table(["joint", f"before [{_unit(content)}]", "after", "floor", "effects"], rows), about
-    )
 
 
 def _error_map(content: dict[str, Any]) -> Markup:
@@ -193,44 +154,38 @@ def _error_map(content: dict[str, Any]) -> Markup:
         return Markup("")
     parts = {name: joint["explained"] for name, joint in joints.items()}
     curves = sorted(next(iter(parts.values())), key=lambda curve: -max(own[curve] for own in parts.values()))
-    rows = [
-        [bold(in_words(curve)), *(f"{100 * max(0.0, own[curve]):.0f} %" for own in parts.values())] for curve in curves
-    ]
+    rows = [[bold(in_words(curve)), *(percent(max(0.0, own[curve])) for own in parts.values())] for curve in curves]
     said = bullets([f"{name}: {joint['sentence']}" for name, joint in joints.items()], "notes")
     about = (
         "part of the squared error above the floor that a curve of any form explains by itself, "
-        "on top of the base model"
+        "on top of the base model; curves that explain as much are one cause over several variables"
     )
     shown = table(["curve", *joints], rows)
     return _titled("What carries the error", said + _curve(content, joints) + shown, about)
 
 
 def _curve(content: dict[str, Any], joints: dict[str, dict[str, Any]]) -> Markup:
-    """The curve that takes most away of the squared error."""
-    squares = {
-        name: joint["validation_rmse_before"] ** 2 - joint["validation_rmse_after"] ** 2
-        for name, joint in joints.items()
-        if joint["curve"]
-    }
-    if not squares:
-        return Markup("")
-    worst = max(squares, key=squares.__getitem__)
-    best, unit = joints[worst], units_for("N m", _types(content, [worst]))
-    trace = {
-        "type": "scatter",
-        "mode": "lines+markers",
-        "name": worst,
-        "x": best["curve"]["at"],
-        "y": best["curve"]["torque"],
-        "line": {"color": "var(--simulated)", "width": 2},
-        "hovertemplate": f"%{{x:.3g}}: %{{y:.3g}} {unit}<extra></extra>",
-    }
-    layout = {
-        "xaxis": {"title": {"text": best["best_label"]}},
-        "yaxis": {"title": {"text": f"{best['kind']} of {worst} [{unit}]"}},
-        "showlegend": False,
-    }
-    return figure("error-map", [trace], layout, height=300)
+    """The curve of each joint: a figure of all over the same variable, and a table of their knots."""
+    shown = {name: joint for name, joint in joints.items() if joint["curve"]}
+    parts: list[Markup] = []
+    for label in dict.fromkeys((joint["best_label"], joint["kind"]) for joint in shown.values()):
+        own = {name: joint for name, joint in shown.items() if (joint["best_label"], joint["kind"]) == label}
+        parts.append(_knots(own, units_for("N m", _types(content, own)), len(parts)))
+    return joined(parts)
+
+
+def _knots(joints: dict[str, dict[str, Any]], unit: str, count: int) -> Markup:
+    """Curves over one variable."""
+    variable, kind = next((joint["best_label"], joint["kind"]) for joint in joints.values())
+    traces, units = [], {"variable": variable, "value": f"{kind} [{unit}]"}
+    for name, joint in joints.items():
+        at, values = joint["curve"]["at"], joint["curve"]["torque"]
+        hover = f"%{{x:.3g}}: %{{y:.3g}} {unit}"
+        trace = {"type": "scatter", "mode": "lines+markers", "name": name, "x": at, "y": values, "hovertemplate": hover}
+        traces.append(trace)
+    layout = {"xaxis": {"title": {"text": variable}}, "yaxis": {"title": {"text": units["value"]}}}
+    knots = knots_table({name: units | joint["curve"] for name, joint in joints.items()})
+    return figure(f"error-map{count or ''}", traces, layout, height=300) + knots
 
 
 def _advice(content: dict[str, Any]) -> Markup:

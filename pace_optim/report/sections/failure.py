@@ -10,7 +10,7 @@ from typing import Any
 from markupsafe import Markup
 
 from pace_actuators.joint_units import JointType, joint_label, units_for
-from pace_actuators.text import position_text, position_unit, short_duration, three_figures
+from pace_actuators.text import percent, position_text, position_unit, short_duration, three_figures
 
 from ..markup import Section, bullets, choice, html, json_script, log_step, table
 from ..run_data import RunData
@@ -85,7 +85,7 @@ def _by_joint(content: dict[str, Any]) -> Markup:
     factor, unit = position_unit([joint["rmse"].get(part) for joint in joints.values() for part in parts], ["hinge"])
     rows = []
     for (name, joint), own in zip(joints.items(), types, strict=True):
-        share = 100 * joint["share_above_floor"]
+        share = joint["share_above_floor"]
         label = joint_label(name, own, types, unit)
         rows.append(
             [
@@ -93,8 +93,9 @@ def _by_joint(content: dict[str, Any]) -> Markup:
                 *(three_figures(factor * joint["rmse"][part]) for part in parts),
                 three_figures(factor * joint["noise_floor"]),
                 html(
-                    '<span class="share"><div><i style="width:{{ share }}%"></i></div>{{ share }} %</span>',
-                    share=f"{share:.0f}",
+                    '<span class="share"><div><i style="width:{{ share }}%"></i></div>{{ text }}</span>',
+                    share=f"{100 * share:.0f}",
+                    text=percent(share),
                 ),
                 joint["sentence"].removeprefix(f"{name}: ").removeprefix(f"{name} "),
             ]
@@ -163,7 +164,7 @@ def _over_time(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str
     ]
     return {
         "text": f"Error {errors}; noise {position_text(floor, types_of(joint))} ({source}), so "
-        f"{100 * one['share_above_floor']:.0f} % of the squared error is above it. Grey: ±2 σ of the noise"
+        f"{percent(one['share_above_floor'])} of the squared error is above it. Grey: ±2 σ of the noise"
         + ("; shaded: kept for validation." if shapes[1:] else "."),
         "traces": [{"x": time, "y": _numbers(curve[key], factor)} for key in ("low", "high")],
         "layout": {"yaxis": _title(f"error [{unit}]"), "shapes": shapes},
@@ -268,7 +269,7 @@ def _spectrum(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str,
     factor, unit = position_unit(bands["rms"], types_of(joint))
     text = "Nothing is above the noise."
     if bands["most"] is not None:
-        text = f"{100 * bands['most_share']:.0f} % of what is above the noise lies {bands['most']}."
+        text = f"{percent(bands['most_share'])} of what is above the noise lies {bands['most']}."
     rms, noise = (_numbers([value or None for value in bands[key]], factor) for key in ("rms", "noise_rms"))
     return {
         "text": text + " Each point is a third of an octave.",
@@ -353,12 +354,12 @@ def _loops(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str, An
 def _white(joint: dict[str, Any], r: int, facts: dict[str, Any]) -> dict[str, Any]:
     content = joint["recordings"][r]["whiteness"]
     lag, rho = content["lag"], content["autocorrelation"]
-    share, time = 100 * content["predictable"], content["correlation_time"]
+    share, time = content["predictable"], content["correlation_time"]
     if abs(content["lag_1"]) < 0.1:
-        text = f"As good as white: the sample before explains {share:.2g} % of the variance."
+        text = f"As good as white: the sample before explains {percent(share)} of the variance."
     else:
         text = (
-            f"Not white: the sample before explains {share:.0f} % of the variance, and errors stay alike for "
+            f"Not white: the sample before explains {percent(share)} of the variance, and errors stay alike for "
             f"{short_duration(time)}. Something that can be modelled is left."
         )
     return {

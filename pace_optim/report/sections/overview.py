@@ -12,7 +12,7 @@ from pace_actuators.drive_result import ALL
 from pace_actuators.joint_units import JointType, joint_label, units_for
 from pace_actuators.text import SHOWN, duration, position_text, position_unit, pretty_unit, three_figures
 from pace_optim.run.result import FitResult
-from pace_optim.run.summary import ABOVE_NOISE, next_line
+from pace_optim.run.summary import ABOVE_NOISE, above_noise, next_lines
 
 from ..markup import Section, bullets, folded, html
 from ..run_data import RunData
@@ -53,7 +53,11 @@ def _plain_headline(result: FitResult) -> str:
     errors = result.rmse.get("validation") or result.rmse["train"]
     times = result.times_noise * errors[ALL] / result.rmse["train"][ALL]
     where = "on held-out data" if result.rmse.get("validation") else "on the training data"
-    return f"{times:.2g} times the noise {where}" if times >= ABOVE_NOISE else f"At the noise {where}"
+    return (
+        f"{times:.2g} times the noise {where}: something is missing"
+        if times >= ABOVE_NOISE
+        else f"At the noise {where}"
+    )
 
 
 def _follows(result: FitResult) -> str:
@@ -88,8 +92,7 @@ def _verdict(run: RunData) -> str:
 
 def _next(run: RunData) -> str:
     """The command that comes next, where nothing was diagnosed."""
-    compared = bool(run.read_json("comparison.json"))
-    lines = [] if run.read_json("diagnosis.json") else next_line(run.result, run.folder.resolve(), compared=compared)
+    lines = [] if run.read_json("diagnosis.json") else next_lines(run.result, run.folder.resolve())
     return "".join(lines).removeprefix("next: ")
 
 
@@ -135,7 +138,7 @@ def _figures(result: FitResult) -> Markup:
         ("Validation", said(held_out), "error of all joints"),
         ("Training", said(train), "error of all joints"),
         ("Worst joint", said(error, [result.joint_type(worst)]), worst),
-        ("Delay", f"{1e3 * result.delay_s:.3g} ms", f"of the {result.delay_mode}"),
+        ("Delay", f"{1e3 * result.delay_s:.3g} ms{' ?' * result.std_means_nothing}", f"of the {result.delay_mode}"),
         ("Score", f"{result.score:.2e}", units_for("rad², sum over the joints", result.joint_types)),
         ("Found in", duration(result.wall_time_s), f"{result.simulated_steps / 1e6:.3g} M simulated steps"),
     ]
@@ -158,7 +161,9 @@ def _warnings(result: FitResult) -> Markup:
     count = len(result.warnings)
     if not count:
         text = "No parameter is at a bound, without influence, or confounded with another."
-        return html('<div class="callout good"><h3>No warnings</h3><p>{{ text }}</p></div>', text=text)
+        if more := above_noise(result):
+            text += f" But the training error is {more}."
+        return html('<div class="callout good"><h3>No warnings of parameters</h3><p>{{ text }}</p></div>', text=text)
     title = "1 warning" if count == 1 else f"{count} warnings"
     sentences = [pretty_unit(text) for text in result.warnings]
     most = SHOWN if count > SHOWN + 1 else count  # one more takes no more room than its heading would

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 from markupsafe import Markup
 
@@ -47,12 +48,26 @@ def parameters(run: RunData) -> Section:
         )
         head = ["", "value", "± std", "unit", "between its bounds", ""]
         cards.append(_article("The whole robot", "", table(head, rows, "values") + note))
+    cards += [
+        _article(in_words(effect), "knots", knots_table(by_joint)) for effect, by_joint in run.result.curves.items()
+    ]
     return Section(
         id="parameters",
         title="Parameters",
         lead=_FAR if result.std_means_nothing else _BARS,
         html=html('<div class="cards">{{ cards }}</div>', cards=joined(cards)),
     )
+
+
+def knots_table(curves: Mapping[str, Mapping[str, Any]]) -> Markup:
+    """The knots of curves and their values, two rows for each joint, so that a law can be written from them."""
+    most = max(len(own["at"]) for own in curves.values())
+    rows = []
+    for joint, own in curves.items():
+        blank = [""] * (most - len(own["at"]))
+        rows.append([bold(f"{joint}, {pretty_unit(own['variable'])}"), *(f"{x:.3g}" for x in own["at"]), *blank])
+        rows.append([pretty_unit(own["value"]), *(f"{y:.4g}" for y in own["torque"]), *blank])
+    return table(["knot", *(str(i + 1) for i in range(most))], rows, "knots")
 
 
 def _article(title: str, unit: str, content: Markup) -> Markup:
@@ -129,7 +144,7 @@ def _axis(low: float, high: float) -> Markup:
         anchor = "start" if x < 20 else "end" if x > _WIDTH - 20 else "middle"
         parts.append(_line("base", x, x, 0, 4))
         said = '<text x="{{ x }}" y="16" text-anchor="{{ anchor }}">{{ tick }}</text>'
-        parts.append(html(said, x=x, anchor=anchor, tick=f"{tick:.6g}"))
+        parts.append(html(said, x=x, anchor=anchor, tick=f"{tick:.4g}"))
     return _svg(parts)
 
 
@@ -169,9 +184,9 @@ def _between(run: RunData, label: str, value: float, factor: float) -> str:
         '<span class="range{{ css }}"><small>{{ low }}</small><span class="track"><i style="left:{{ share }}%"></i>'
         "</span><small>{{ high }}</small></span>",
         css=css,
-        low=f"{factor * low:g}",
+        low=f"{factor * low:.3g}",
         share=f"{100 * min(max(share, 0.0), 1.0):.1f}",
-        high=f"{factor * high:g}",
+        high=f"{factor * high:.3g}",
     )
 
 
@@ -190,7 +205,7 @@ def _flags(run: RunData, label: str, value: float) -> Markup:
         flags.append("not determined: its prior")
     elif label in result.no_influence:
         flags.append("no influence")
-    for group in result.indistinguishable:
+    for group in () if result.std_means_nothing else result.indistinguishable:
         if label in group:
             others = [_beside(other, label) for other in group if other != label]
             flags.append("cannot be separated from " + " and ".join(dict.fromkeys(others)))

@@ -1,8 +1,7 @@
-"""What was fitted, the worst first: what was noticed when it was read, and what it asked of the drives."""
+"""What was fitted: what was noticed when it was read, and what it asked of the drives."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -21,9 +20,8 @@ _DRIVES = 40
 def recordings(run: RunData) -> Section:
     """A row per recording, its notes underneath; then the drives in each."""
     rows, notes = [], [*run.result.findings, *run.result.notes]
-    ordered = by_error(run.recordings)
-    factor, unit = position_unit([error_of(recording) for recording in ordered], run.result.joint_types)
-    for recording in ordered:
+    factor, unit = position_unit([error_of(recording) for recording in run.recordings], run.result.joint_types)
+    for recording in run.recordings:
         own = [note for note in notes if note.startswith(f"{recording.name}: ")]
         notes = [note for note in notes if note not in own]
         said = bullets([note.removeprefix(f"{recording.name}: ") for note in own], "notes") if own else ""
@@ -36,17 +34,13 @@ def recordings(run: RunData) -> Section:
     )
     shown = table(head, rows, "recordings") if rows else html(uses, uses=run.result.recordings)
     shown += bullets(notes, "notes") if notes else ""
-    return Section(id="recordings", title="Recordings", html=shown + _drives(run, [each.name for each in ordered]))
+    drives = _drives(run, [each.name for each in run.recordings])
+    return Section(id="recordings", title="Recordings", html=shown + drives)
 
 
 def error_of(recording: RecordingData) -> float:
     """Root mean square over all joints and samples; large where it is no number."""
     return rms(np.nan_to_num(recording.error, nan=1e3, posinf=1e3, neginf=-1e3)) or 0.0
-
-
-def by_error(every: Sequence[RecordingData]) -> list[RecordingData]:
-    """The recordings, the one with the largest error first."""
-    return sorted(every, key=error_of, reverse=True)
 
 
 def _facts(recording: RecordingData) -> list[str]:
@@ -103,7 +97,8 @@ def _drive(own: dict[str, Any]) -> list[str]:
         f"{own['asked_rms']:.3g}",
         _number(limit),
         f"{own['gravity_peak']:.3g}",
-        _beyond(own["speed_peak"], own["velocity_limit"]),
+        # without a stall torque there is no torque-speed line, and the limit does not act
+        _beyond(own["speed_peak"], None if own["saturation_effort"] is None else own["velocity_limit"]),
         _number(own["velocity_limit"]),
     ]
 

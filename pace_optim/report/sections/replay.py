@@ -36,7 +36,7 @@ def replay(run: RunData) -> Section | None:
         return None
     bias = run.result.parameters["encoder_bias"]
     motions = motions_of(
-        model, run.joint_names, run.worst_first()[:_RECORDINGS_ON_PAGE], [bias[name] for name in run.joint_names]
+        model, run.joint_names, run.worst(_RECORDINGS_ON_PAGE), [bias[name] for name in run.joint_names]
     )
     looks = None if run.model_file is None else looks_of(run.model_file)
     return Section(

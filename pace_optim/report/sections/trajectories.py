@@ -13,7 +13,6 @@ from pace_optim.run.tensors import held_out_spans, rms
 
 from ..markup import Section, choice, html, json_script
 from ..run_data import RecordingData, RunData
-from .recordings import by_error
 
 _SAMPLES_ON_PAGE = 160_000
 """Of all joints and recordings together; each takes some 19 bytes of the page."""
@@ -25,14 +24,13 @@ def trajectories(run: RunData) -> Section | None:
     """Curves to choose from."""
     if not run.recordings:
         return None
-    ordered = by_error(run.recordings)
     per_curve = _SAMPLES_ON_PAGE // (len(run.recordings) * len(run.joint_names))
     per_curve = min(max(per_curve, _FEWEST_PER_CURVE), _MOST_PER_CURVE)
     content = {
         "joints": list(run.joint_names),
-        "recordings": [_encode(recording, per_curve, run.result.joint_types) for recording in ordered],
+        "recordings": [_encode(recording, per_curve, run.result.joint_types) for recording in run.recordings],
     }
-    r, j = _largest_error(ordered)
+    r, j = _largest_error(run.recordings)
     return Section(
         id="trajectories",
         title="Trajectories",
@@ -40,7 +38,7 @@ def trajectories(run: RunData) -> Section | None:
         html=html(
             '<div class="explorer">{{ recording }}{{ joint }}<p class="errors-here"></p>'
             '<div class="canvas" style="height:540px"></div>{{ script }}</div>',
-            recording=choice("recording", [each.name for each in ordered], at=r),
+            recording=choice("recording", [each.name for each in run.recordings], at=r),
             joint=choice("joint", run.joint_names, at=j),
             script=json_script(content),
         ),

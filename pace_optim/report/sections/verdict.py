@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import os
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
 
-from pace_actuators.text import capitalised, conjoined, listed, sizes_by_joints
+from pace_actuators.joint_units import joint_label, units_for
+from pace_actuators.text import capitalised, conjoined, in_words, listed, sizes_by_joints, three_figures
 from pace_optim.run.result import FitResult
 from pace_optim.terminal.cli import command
 
-from ..markup import bullets, html, joined
+from ..markup import bold, bullets, html, joined, table
 from ..run_data import RunData
 
 _SHOWN = 4
-"""Sizes in the overview, and joints in the headline, at most."""
-_FAR = 3.0
-"""Times its floor above which a joint is far from it, in a diagnosis that does not state it."""
+"""Joints in the headline, at most."""
 
 
 def verdict_first(run: RunData) -> Markup:
@@ -32,18 +32,50 @@ def _in_short(run: RunData) -> Markup:
     content = run.read_json("diagnosis.json")
     if not content:
         return Markup("")
-    sizes = [
-        f"{effect} {parameter} of {listed(joints, 6)}: {text}"
-        for (effect, parameter, text), joints in sizes_by_joints(content.get("sizes", [])).items()
-    ]
-    said = sizes[:_SHOWN]
-    if len(sizes) > _SHOWN:
-        said.append(f"and {len(sizes) - _SHOWN} more")
-    said += [
+    said = [
         f"{effect} cannot be separated from {', '.join(likes)}" for effect, likes in content.get("likes", {}).items()
     ]
     link = html('<p><a href="#diagnosis">What was tried, and the evidence</a></p>')
-    return _callout(run, content, joined([bullets(said, "notes"), link] if said else [link]))
+    return _callout(run, content, joined([_laws(content), bullets(said, "notes") if said else Markup(""), link]))
+
+
+def _laws(content: dict[str, Any]) -> Markup:
+    """Of each joint the law that was found, how large it is, and the error before and after, also in floors.
+
+    Joints without a law that end near their floor share a row, with the largest of their errors.
+    """
+    joints, types = content["joints"], [joint.get("type", "hinge") for joint in content["joints"].values()]
+    curves = {label.partition("@")[0] for label in content.get("free_form", [])}
+    sizes: dict[tuple[str, str], list[str]] = {}
+    for (effect, parameter, text), own in sizes_by_joints(content.get("sizes", [])).items():
+        for name in own:
+            sizes.setdefault((effect, name), []).append(f"{parameter} {text}")
+    rows = []
+    for (name, joint), own in zip(joints.items(), types, strict=True):
+        if joint["effects"] or name in content.get("more", {}):
+            laws = [f"curve: {in_words(effect).lower()}" if effect in curves else effect for effect in joint["effects"]]
+            size = ["; ".join(sizes.get((effect, name), [])) for effect in joint["effects"]]
+            knots = ["knots: see the diagnosis"] if curves & set(joint["effects"]) else []
+            about = [", ".join(laws) or "–", "; ".join([*filter(None, size), *knots]) or "–"]
+            rows.append([bold(joint_label(name, own, types)), *about, *_errors([joint])])
+    others = [j for name, j in joints.items() if not j["effects"] and name not in content.get("more", {})]
+    if others:
+        which = f"{'other' if rows else 'all'} joints ({len(others)}): the largest"
+        rows.append([which, "–", "–", *_errors(others)])
+    parts = " (validation / training)" if any(joint.get("training_rmse") for joint in joints.values()) else ""
+    unit = units_for("mrad", types)
+    head = ["joint", "law found", "size", f"before [{unit}]", f"left [{unit}]{parts}", "left in floors"]
+    return table(head, rows, "laws")
+
+
+def _errors(joints: Sequence[dict[str, Any]]) -> list[str]:
+    """The largest error before and after, in validation and training, and the latter in floors."""
+    keys = [key for key in ("validation_rmse_after", "training_rmse") if joints[0].get(key) is not None]
+    return [
+        three_figures(1e3 * max(joint["validation_rmse_before"] for joint in joints)),
+        " / ".join(three_figures(1e3 * max(joint[key] for joint in joints)) for key in keys),
+        " / ".join(f"{max(joint[key] / joint['floor'] for joint in joints):.2g}" for key in keys),
+    ]
 
 
 def headline(run: RunData) -> str:
@@ -70,23 +102,23 @@ def _heading(run: RunData, content: dict[str, Any]) -> tuple[str, str]:
         if left:  # each joint alone is at its floor: the fit of the robot is not
             return "bad", f"No effect is missing, but this fit ended at {left}"
         return "good", "Nothing is missing"
-    found = conjoined(_found(content))
+    found, more = conjoined(_found(content)), content.get("more", {})
+    rest = [f"Covered by a curve: {listed(covered, _SHOWN)}"] if (covered := _covered(content)) else []
+    if more:
+        rest.append(f"More is missing on {listed((f'{joint} ({left})' for joint, left in more.items()), _SHOWN)}")
     if not found:
-        curves = set(content.get("free_form", []))
-        part = "all of it" if set(content.get("paying", [])) - curves else "it"
-        instead = ": a curve takes its place" if curves else ""
-        return "bad", f"Something is missing, and no known effect explains {part}{instead}"
-    joints = _unexplained(content)
-    if joints or content["verdict"] == "unknown":
-        where = f" on {listed(joints, _SHOWN)}" if joints else ""
-        begin = "In this run" if has_it else "Missing" if content["added"] else "Wrong in the model file"
-        return "bad", f"{begin}: {found}. More is missing{where}"
-    if has_it:
-        if left:
-            return "bad", f"In this run: {found}. More is missing: the error is {left}"
-        return "good", f"What was missing is in this run: {found}"
+        return "bad", ". ".join(["Something is missing, and no known effect has earned its name", *rest])
+    if left and has_it and not more:
+        rest.append(f"More is missing: the error is {left}")
+    elif content["verdict"] == "unknown" and not rest:
+        rest.append("More is missing")
+    is_bad = any(each.startswith("More") for each in rest) or content["verdict"] == "unknown"
     begin, this = ("Missing", " in this run") if content["added"] else ("Wrong in the model file", " of this run")
-    return "good", f"{begin}{this if _other_run(run, content) else ''}: {found}"
+    if has_it:
+        begin, this = "In this run" if rest else "What was missing is in this run", ""
+    elif rest or not _other_run(run, content):
+        this = ""
+    return "bad" if is_bad else "good", ". ".join([f"{begin}{this}: {found}", *rest])
 
 
 def _found(content: dict[str, Any]) -> list[str]:
@@ -99,15 +131,10 @@ def _found(content: dict[str, Any]) -> list[str]:
     return [capitalised(names[0]), *names[1:]] if names else [""]
 
 
-def _unexplained(content: dict[str, Any]) -> list[str]:
-    """Joints on which more is missing than was found: far from their floor, or with a curve of any form."""
-    far = content.get("cfg", {}).get("judging", {}).get("far", _FAR)
+def _covered(content: dict[str, Any]) -> list[str]:
+    """Joints on which a curve stands where no effect has earned its name."""
     curves = {label.partition("@")[0] for label in content.get("free_form", [])}
-    return [
-        name
-        for name, joint in content["joints"].items()
-        if joint["validation_rmse_after"] > far * joint["floor"] or curves & set(joint["effects"])
-    ]
+    return [name for name, joint in content["joints"].items() if curves & set(joint["effects"])]
 
 
 def _has_it(fit: FitResult, content: dict[str, Any]) -> bool:
@@ -124,14 +151,14 @@ def _callout(run: RunData, content: dict[str, Any], more: Markup) -> Markup:
     links = [link["label"] for link in content.get("links", [])]
     other = _other_run(run, content)
     return html(
-        '<div class="callout {{ css }}"><p>{{ summary }}</p>'
+        '<div class="callout {{ css }}">{% for each in summary %}<p>{{ each }}</p>{% endfor %}'
         "{% if has_it %}<p>This run is the fit with it.</p>{% elif (effects or links) and not other %}<p>{{ why }}: "
         "<code>{{ command }} …{% if effects %} --effects {{ effects }}{% endif %}{% if links %} --links {{ links }}"
         '{% endif %}</code></p>{% endif %}{% if other %}<p class="other">'
         'The run {{ "without" if has_it else "with" }} it: <b>'
         '<a href="{{ other }}/report.html">{{ other.name }}</a></b></p>{% endif %}{{ more }}</div>',
         css=_heading(run, content)[0],
-        summary=content["summary"],
+        summary=content.get("evidence") or [content["summary"]],
         has_it=_has_it(run.result, content),
         effects=shlex.join(dict.fromkeys([*run.result.effects, *effects])),
         links=shlex.join(links),

@@ -213,6 +213,23 @@ def test_noise_does_not_count_in_the_spectrum_either():
     assert max(compared.content["where"]["frequency"]["error"]) > 0.85  # two thirds, were noise counted
 
 
+def test_a_nearly_constant_error_is_called_so_and_not_by_its_octave():
+    """ "98 % of the remaining error lies below 0.062 Hz" was a constant."""
+    compared = compare_joint("knee", 0, [track(-17e-3 + 1e-3 * np.sin(2 * np.pi * 9.0 * TIME))])
+    (place,) = compared.places
+    assert compared.content["sentence"] == place.sentence
+    assert place.sentence.startswith("knee: the error is nearly constant, −17 mrad (simulated less measured): a torque")
+    assert place.by == ("constant",) and place.share > 0.99
+
+
+def test_an_error_at_standstill_is_called_so_however_long_the_joint_stands():
+    """A joint stood in 85 % of the time with 95 % of the error, and a range of positions was named."""
+    position = np.where(TIME < 17.0, 0.3, 0.3 + 0.2 * np.sin(2 * np.pi * (TIME - 17.0)))
+    error = np.where(TIME < 17.0, 1e-3, 2e-4) * np.sign(np.sin(2 * np.pi * 0.3 * TIME))
+    (place,) = compare_joint("knee", 0, [track(error, position)]).places
+    assert place.by == ("speed",) and "lies where the joint stands still (8" in place.sentence
+
+
 def test_an_error_at_high_speed_is_said_to_be_there():
     error = np.where(np.abs(motion_of(CHIRP, DT, 0.0).speed) > 10.0, 1e-3, 0.0)
     assert "above 5.6 rad/s" in sentence(track(error))

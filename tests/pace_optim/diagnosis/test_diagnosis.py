@@ -27,6 +27,7 @@ from pace_optim.joints.fits.labels import labels
 from pace_optim.terminal.parallel import parallel_map
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))
+SPRING, CREEP = get_effect("parallel_spring"), get_effect("creeping_friction")
 FOLDS = DEFAULT.candidates.folds
 
 
@@ -239,6 +240,28 @@ def test_the_ranking_begins_with_what_was_added_and_names_its_rivals():
     assert (pair.chosen, pair.rival, pair.joints) == (STRIBECK, QUADRATIC, [0])
     assert pair.models == ("with stribeck", "with quadratic")
     json.dumps(entries)
+
+
+def test_what_pays_no_longer_beside_what_was_added_is_not_said_to_pay():
+    """A delay stood as "would pay" on a joint that another joint's effect had brought to the noise."""
+    trials = [
+        [make_trial(STRIBECK, 0, 2e-4), make_trial(QUADRATIC, 0, 2.1e-4), make_trial(GAIN, 0, 9e-4)],
+        [make_trial(SPRING, 1, 5e-4), make_trial(CREEP, 1, 9.9e-4, significant=False)],
+    ]
+    this = Round(trials=trials, chosen=[STRIBECK, None], rivals=[[], []])
+    status = {}
+    for left in (1e-4, 1e-3):
+        entries = ranking(outcome_of([1e-3] * 2, [3e-4, left], [STRIBECK], [[True, False]], [this]), ("hip", "knee"))
+        status[left] = {entry["effect"]: entry["status"] for entry in entries}
+        assert entries[0]["tried"] == {"hip": [pytest.approx(1e-3), pytest.approx(2e-4)]}
+    assert status[1e-4] == {
+        "stribeck_friction": "added",
+        "quadratic_friction": "as good",
+        "torque_gain": "leaves more",
+        "parallel_spring": "leaves more",
+        "creeping_friction": "does not pay",
+    }
+    assert status[1e-3]["parallel_spring"] == "would pay"
 
 
 @pytest.mark.parametrize(

@@ -57,15 +57,21 @@ def test_the_run_with_what_was_missing_is_not_told_to_add_it(tmp_path):
 
 
 CURVE = "torque_over_position@hip"
-MORE = {"joints": {**make_diagnosis()["joints"], "hip": {**make_diagnosis()["joints"]["hip"], "floor": 1e-5}}}
+MORE = {"more": {"hip": "0.4 mrad, 40 floors"}}
 """The hip ends far from its floor."""
+COVERED = {
+    "joints": make_diagnosis()["joints"] | {"hip": make_diagnosis()["joints"]["hip"] | {"effects": [CURVE[:20]]}}
+}
+COVERED |= {"free_form": [CURVE], "paying": ["stribeck_friction@knee|ankle", CURVE]}
+COVERED["joints"]["hip"]["effects"] = ["torque_over_position"]
 
 
 @pytest.mark.parametrize(
     ("content", "run", "headline"),
     [
+        (COVERED, {}, "Missing: Stribeck friction at knee, ankle. Covered by a curve: hip"),
         ({}, {}, "Missing: Stribeck friction at hip, knee, ankle"),
-        (MORE, {}, "Missing: Stribeck friction at hip, knee, ankle. More is missing on hip"),
+        (MORE, {}, "Missing: Stribeck friction at hip, knee, ankle. More is missing on hip (0.4 mrad, 40 floors)"),
         ({}, {"effects": ["stribeck_friction"]}, "What was missing is in this run: Stribeck friction"),
         (
             {},
@@ -75,12 +81,12 @@ MORE = {"joints": {**make_diagnosis()["joints"], "hip": {**make_diagnosis()["joi
         (
             {"added": [], "verdict": "unknown", "paying": [CURVE], "free_form": [CURVE]},
             {},
-            "Something is missing, and no known effect explains it: a curve takes its place",
+            "Something is missing, and no known effect has earned its name",
         ),
         (
             {"added": [], "verdict": "unknown", "paying": ["stribeck_friction", CURVE], "free_form": [CURVE]},
             {},
-            "Something is missing, and no known effect explains all of it: a curve takes its place",
+            "Something is missing, and no known effect has earned its name",
         ),
         (
             {"added": [], "verdict": "nothing_missing"},
@@ -122,7 +128,7 @@ def test_commands_in_the_advice_can_be_copied(tmp_path):
 def test_what_is_unknown_has_an_error_map(tmp_path):
     page = page_of(folder_with(tmp_path / "run", make_diagnosis("unknown")))
     assert "error-map" in page.ids
-    assert "no known effect explains it" in page.text and "explains 80 % of it" in page.text
+    assert "no known effect has earned its name" in page.text and "explains 80 % of it" in page.text
 
 
 def test_nothing_missing_needs_no_chart(tmp_path):
@@ -160,3 +166,26 @@ def test_a_command_can_be_copied_where_joints_have_spaces_and_there_are_several(
     folder = write_run(tmp_path / "run")
     write_json(folder / "diagnosis.json", make_diagnosis() | {"added": ["torque_ripple@A1 shoulder|A2"], "paying": []})
     assert "--effects 'torque_ripple@A1 shoulder|A2'" in page_of(folder).text
+
+
+def test_a_curve_has_a_table_of_its_knots(tmp_path):
+    """A user could not write a friction law from "9 values: see the report"."""
+    knots = {
+        "variable": "speed [rad/s]",
+        "value": "friction [N m]",
+        "at": [0.0, 0.24, 0.63],
+        "torque": [6.4, 4.39, 3.86],
+    }
+    folder = write_run(tmp_path / "run")
+    make_result(curves={"friction_over_speed": {"knee": knots}}).save(folder / "result.json")
+    text = page_of(folder).text
+    assert "knee, speed [rad/s] 0 0.24 0.63" in text and "friction [N m] 6.4 4.39 3.86" in text
+
+
+def test_the_top_of_the_page_has_law_size_and_error_of_each_joint(tmp_path):
+    content = make_diagnosis()
+    size = {"effect": "stribeck_friction", "parameter": "effort", "joint": "knee", "value": 1.8, "std": 0.01}
+    content["sizes"] = [size | {"unit": "N m", "factor": None, "at_bound": False}]
+    content["joints"]["knee"]["training_rmse"] = 6e-4
+    top = page_of(folder_with(tmp_path / "run", content)).text.partition("Error of each joint")[0]
+    assert "knee stribeck_friction effort 1.8 ± 0.01 N m 4.30 0.400 / 0.600 2 / 3" in " ".join(top.split())

@@ -142,7 +142,7 @@ def test_a_diagnosis_tells_each_in_its_unit(fitted):
     page = report_text(run).decode()
     (run / "diagnosis.json").unlink()
     assert "<b>axis [mm]</b>" in page and "before [mrad or mm]" in page
-    assert "friction of axis [N]" in page
+    assert "friction [N]" in page
 
 
 def test_a_carriage_far_from_its_target_is_not_told_in_radians(fitted, log):

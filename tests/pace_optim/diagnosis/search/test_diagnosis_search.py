@@ -122,7 +122,7 @@ def test_one_recording_is_advised_where_it_tells_several_pairs_apart(bench, monk
     del apart[GAIN][1]
     told, not_told = next_experiments(bench.problem, pairs, noise)
     assert "9 mrad, 90 times" in told and "torque_gain" not in told
-    assert "from torque_gain (servo). Nor would any of 8 others tried." in not_told
+    assert "from torque_gain (servo). Nor would any of 8 simulated recordings." in not_told
 
 
 def test_a_base_parameter_takes_up_a_late_log_and_a_turned_mass(bench):

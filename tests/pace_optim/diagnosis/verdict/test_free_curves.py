@@ -16,7 +16,7 @@ from pace_actuators.joint_units import all_hinges
 from pace_optim.diagnosis import DiagnosisSettings, candidate_effects, diagnose, search_effects
 from pace_optim.diagnosis.checks.data_check import DataCheck
 from pace_optim.diagnosis.findings.advice import advise
-from pace_optim.diagnosis.findings.findings import summary_of
+from pace_optim.diagnosis.findings.findings import evidence_of, verdict_of
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.verdict.free_curves import Curves, _formula, error_map, fit_curves, take_curves
 from pace_optim.diagnosis.verdict.names import Names
@@ -259,10 +259,10 @@ def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeyp
     assert found.verdict == "effect" and found.paying == ["parallel_spring@a", "friction_over_speed@b"]
     assert found.added == ["parallel_spring@a"] and found.free_form == ["friction_over_speed@b"]
     assert found.explained == pytest.approx(1 - 9 / 54, abs=0.01)  # with what is kept
-    said = summary_of(found, robot)
+    said = " ".join([verdict_of(found, robot), *evidence_of(found, robot)])
     assert said.startswith(
-        "Missing: parallel_spring@a. On other joints no known effect explains the error; a curve takes its place: "
-        "friction_over_speed@b. On held-out recordings all of it"
+        "Missing: parallel_spring@a. Covered by a curve, without a name: friction_over_speed@b. More is missing on "
+        "c (3 mrad, 30 floors). On held-out recordings all of it"
     )
     monkeypatch.setattr("pace_optim.diagnosis.findings.advice.next_experiments", lambda *_: [])
     monkeypatch.setattr("pace_optim.diagnosis.findings.advice.drive_in_force", lambda _: {})
@@ -282,10 +282,10 @@ def test_an_unknown_effect_gets_a_curve_and_the_robot_is_fitted_with_it(run):
     found = diagnose(DiagnosisSettings(run=run.folder, effects=["torque_gain"], only=True))
     assert found.verdict == "unknown" and found.added == []
     assert found.paying == found.free_form == ["friction_over_position"]
-    assert "A curve, friction_over_position, explains" in found.summary
+    assert "A curve, friction_over_position, explains" in " ".join(found.evidence)
     refit = FitResult.load(found.runs[-1])
     assert refit.task == BENCH and refit.effects == ["friction_over_position"]
     before, after = (step["validation_rmse"] for step in found.ladder)
     assert refit.rmse["validation"]["all"] == pytest.approx(after, rel=0.5) and after < 0.5 * before
     page = write_report(found.runs[-1]).read_text("utf-8")
-    assert "no known effect explains it: a curve takes its place" in page and "error-map" in page
+    assert "no known effect has earned its name. Covered by a curve: servo" in page and "error-map" in page

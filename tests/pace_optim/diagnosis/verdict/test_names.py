@@ -16,12 +16,12 @@ from pace_optim.diagnosis import Diagnosis, DiagnosisSettings, diagnose
 from pace_optim.diagnosis.checks.data_check import DataCheck
 from pace_optim.diagnosis.checks.stated_facts import excluded_effects
 from pace_optim.diagnosis.findings import findings
-from pace_optim.diagnosis.findings.findings import Findings, summary_of
+from pace_optim.diagnosis.findings.findings import Findings, evidence_of, more_missing, verdict_of
 from pace_optim.diagnosis.search.state import Outcome
-from pace_optim.diagnosis.selection.naming import DIFFERS, doubts
+from pace_optim.diagnosis.selection.naming import CURVE_LEAVES_LESS, DIFFERS, doubts
 from pace_optim.diagnosis.selection.size_consistency import sizes_apart, unevenness
 from pace_optim.diagnosis.verdict import names as names_module
-from pace_optim.diagnosis.verdict.names import Hint, earned_names, shares_of
+from pace_optim.diagnosis.verdict.names import Hint, Names, beside_curves, earned_names, shares_of
 from pace_optim.diagnosis.verdict.sizes import error_bars_from_none
 from pace_optim.diagnosis.verdict.verdict import part_explained, verdict
 from pace_optim.joints.fits.fitted import Fitted
@@ -43,8 +43,8 @@ SURE = make_evidence(100.0, 20.0, 1.0)
     [
         ({}, []),
         ({"left": 40.0}, []),  # it explains more than it leaves
-        ({"left": 60.0}, ["it explains 40 % of what lies above the floor"]),
-        ({"harm": 40.0}, ["it explains 40 % of what lies above the floor"]),
+        ({"left": 60.0}, ["it leaves more than it explains"]),
+        ({"harm": 40.0}, ["it leaves more than it explains"]),
         ({"bars": 1.9}, ["its size is not significant"]),
         ({"uneven": 0.9, "left": 10.0, "floor": 0.1}, ["its size differs between recordings"]),
         (
@@ -275,6 +275,11 @@ def test_loads_that_were_weighed_exclude_a_common_payload_and_measured_gains_the
 # ---- how it is told ------------------------------------------------------------------------------------------------
 
 
+def told_in_words(found, problem):
+    """The verdict and its evidence."""
+    return " ".join([verdict_of(found, problem), *evidence_of(found, problem)])
+
+
 def told_of(outcome, decision, shares, hints=()):
     return Findings(
         outcome=outcome,
@@ -293,30 +298,49 @@ def test_no_effect_is_put_first_where_none_dominates(bench):
     gain = get_effect("torque_gain")
     outcome = ended(bench, 1e-4, (STRIBECK, [True], [1.0, 0.1]), (QUADRATIC, [True], [0.2]), (gain, [True], [0.9]))
     found = told_of(outcome, "effect", {QUADRATIC: 0.4, gain: 0.35, STRIBECK: 0.25})
-    assert summary_of(found, bench.problem).startswith(
+    assert told_in_words(found, bench.problem).startswith(
         "Missing: several effects, none of which dominates: quadratic_friction (40 %), torque_gain (35 %), "
         "stribeck_friction (25 %). On held-out"
     )
     found = told_of(outcome, "effect", {QUADRATIC: 0.9974, gain: 0.0026, STRIBECK: 0.0})
-    assert "quadratic_friction (100 %), torque_gain (0.3 %), stribeck_friction (below 0.1 %)" in summary_of(
+    assert "quadratic_friction (99.7 %), torque_gain (0.3 %), stribeck_friction (0 %)" in told_in_words(
         found, bench.problem
     )
 
 
 def test_nothing_is_explained_to_100_percent_where_more_is_missing(bench):
-    for rmse, part in ((4e-4, "over 99 %"), (1e-4, "100 %")):
+    for rmse, more in ((4e-4, "More is missing on servo (0.4 mrad, 4 floors)."), (1e-4, "")):
         found = told_of(ended(bench, rmse, (STRIBECK, [True], [1.0, 0.1])), "effect", {STRIBECK: 1.0})
-        said = summary_of(replace(found, explained=0.9996), bench.problem)
-        assert f"it explains {part} of what lies above" in said
-        assert ("Something else is missing on servo too" in said) is (rmse > 3e-4)
+        said = told_in_words(replace(found, explained=0.9996), bench.problem)
+        assert "it explains over 99.9 % of what lies above" in said
+        assert more in said and ("More is missing" in said) is bool(more)
+
+
+def test_a_joint_that_is_far_from_the_noise_in_training_alone_is_named(bench):
+    """0.6 mrad in training, 5.5 floors, stood beside "more is missing" on another joint."""
+    found = told_of(ended(bench, 2e-4, (STRIBECK, [True], [1.0, 0.1])), "effect", {STRIBECK: 1.0})
+    assert more_missing(found, bench.problem) == {}
+    found = replace(found, trained=torch.tensor([6e-4]))
+    assert more_missing(found, bench.problem) == {"servo": "0.6 mrad in training, 6 floors"}
+
+
+def test_an_effect_that_a_curve_replaces_becomes_a_hint(bench):
+    """Stribeck friction took 98 % on two calves, and the output said that no known effect explained them."""
+    outcome = ended(bench, 6.2e-4, (STRIBECK, [True], [5.0, 0.3]), before=4.16e-3)
+    evidence = {(STRIBECK, 0): make_evidence(4.16e-3**2, 6.2e-4**2, 1.4e-4**2)}
+    names = Names(outcome=outcome, named=YES, hints=[], evidence=evidence)
+    (hint,) = beside_curves(outcome, names, YES)
+    assert (hint.effect, hint.joint, hint.doubts) == ("stribeck_friction", 0, [CURVE_LEAVES_LESS])
+    assert hint.explained == pytest.approx(0.979, abs=1e-3) and hint.sizes[0]["value"] == pytest.approx(5.0)
+    assert beside_curves(outcome, names, ~YES) == []
 
 
 def test_what_is_unknown_is_told_with_what_comes_nearest(bench):
     outcome = ended(bench, 5e-3, (SPRING, [True], [2.0, 0.1]))
     hint = Hint(effect="parallel_spring", joint=0, explained=0.75, doubts=["it is at a bound", "no drive has it"])
-    said = summary_of(told_of(outcome, "unknown", {SPRING: 1.0}, [hint]), bench.problem)
-    assert said.startswith("Something is missing, and no known effect has earned its name: the validation error is 10 ")
-    assert said.endswith("Hint on servo: parallel_spring. It is not named, as it is at a bound and no drive has it.")
+    said = told_in_words(told_of(outcome, "unknown", {SPRING: 1.0}, [hint]), bench.problem)
+    assert said.startswith("Something is missing, and no known effect has earned its name. More is ")
+    assert said.endswith("It is not named, as it is at a bound and no drive has it.") and "explains 75 %." in said
 
 
 def test_a_hint_has_its_size_and_how_far_that_goes_apart(bench):
@@ -324,9 +348,9 @@ def test_a_hint_has_its_size_and_how_far_that_goes_apart(bench):
     far = [size | {"apart": [1.5, 2.5]}]
     hint = Hint(effect="parallel_spring", joint=0, explained=0.75, doubts=[DIFFERS], sizes=far)
     found = told_of(ended(bench, 5e-3, (SPRING, [True], [2.0, 0.1])), "unknown", {SPRING: 1.0}, [hint])
-    assert summary_of(found, bench.problem).endswith(
-        "Hint on servo: parallel_spring (stiffness 2 ± 0.1 N m/rad). It is not named, as its size differs between "
-        "recordings (stiffness 1.5 to 2.5 N m/rad)."
+    assert told_in_words(found, bench.problem).endswith(
+        "Hint on servo: parallel_spring (stiffness 2 ± 0.1 N m/rad) explains 75 %. It is not named, as its size "
+        "differs between recordings (stiffness 1.5 to 2.5 N m/rad)."
     )
 
 
@@ -365,11 +389,11 @@ def test_it_is_fitted_to_the_whole_robot_all_the_same(run, bench, monkeypatch, s
     assert diagnosis.runs == [str(run.folder), str(refit)][: 1 if broken_off else 2]
     assert Diagnosis.load(refit).verdict == "unknown"
     assert diagnosis.verdict == "unknown" and diagnosis.added == [] and diagnosis.paying == ["parallel_spring"]
-    assert diagnosis.hints[0]["joint"] == "servo" and "75 %" in diagnosis.summary
+    assert diagnosis.hints[0]["joint"] == "servo" and "75 %" in " ".join(diagnosis.evidence)
     assert diagnosis.advice[0].startswith("To try the hints on the whole robot: ")
     assert diagnosis.advice[0].find(" --effects parallel_spring@servo ") > diagnosis.advice[0].find("fit.py --task") > 0
     assert Diagnosis.load(run.folder) == diagnosis
     page = write_report(run.folder).read_text("utf-8")
     advice = "this lowers the error: <code>scripts/fit.py … --effects parallel_spring</code>"
     assert (advice in page) is broken_off  # a refit has it
-    assert "<h1>Something is missing, and no known effect explains all of it</h1>" in page
+    assert "<h1>Something is missing, and no known effect has earned its name. More is missing on servo (" in page

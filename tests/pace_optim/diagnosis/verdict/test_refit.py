@@ -52,7 +52,8 @@ def fit_of(rmse, value=None, std=None, at_bound=(), effect="quadratic_friction.c
     named = {} if value is None else {effect: {"servo": value}}
     own = {"std": {} if value is None else {effect: {"servo": std}}, "std_means_nothing": False, **changes}
     return SimpleNamespace(
-        rmse={"validation": {"servo": rmse, "all": rmse}},
+        rmse={key: {"servo": rmse, "all": rmse} for key in ("train", "validation")},
+        curves={},
         parameters=named,
         at_bound=list(at_bound),
         joint_types=["hinge"],
@@ -65,15 +66,15 @@ def fit_of(rmse, value=None, std=None, at_bound=(), effect="quadratic_friction.c
     [
         (1e-2, fit_of(1e-4, 0.2, 0.01), None),
         (1e-2, fit_of(2e-3, 0.2, 0.01), None),  # far from the floor, and most is explained
-        (1e-2, fit_of(9e-3, 0.2, 0.01), "it explains 19 % of what lies above the floor"),
+        (1e-2, fit_of(9e-3, 0.2, 0.01), "it leaves more than it explains"),
         (1e-2, fit_of(1e-4, 0.01, 0.01), "its size is not significant"),
         (1e-2, fit_of(2e-3, 0.2, None), "its size is not significant"),
         (1e-2, fit_of(2e-3, 0.2, None, std_means_nothing=True), None),  # its joint alone knows
-        (2e-3, fit_of(1.9e-3, 0.2, 0.01), "it explains 10 % of what lies above the floor"),  # so little is missing
+        (2e-3, fit_of(1.9e-3, 0.2, 0.01), "it leaves more than it explains"),  # so little is missing
         (
             2e-2,
             fit_of(8e-3, 0.2, 0.01),
-            "it explains 36 % of what lies above the floor",
+            "it leaves more than it explains",
         ),  # the joint alone does as well
     ],
 )
@@ -127,13 +128,14 @@ def test_verdict_errors_and_sizes_are_those_of_the_whole_robot_s_fit(tmp_path):
     assert told.sizes == [sizes[0] | {"value": 0.25, "std": 0.01}, sizes[1]]
     assert told.joints["servo"]["validation_rmse_after"] == pytest.approx(1.5e-4)
     assert [step["run"] for step in told.ladder] == told.runs
-    assert "the whole robot's validation error falls from 10 to 0.15 mrad" in told.summary
+    assert "the whole robot's validation error falls from 10 to 0.15 mrad" in told.evidence[-1]
     far = told_again(found, fit_of(2e-3, 0.25, 0.01), sizes, tmp_path)
-    assert far.sizes[0]["std"] is None and "Something else is missing on servo too" in far.summary
+    assert far.sizes[0]["std"] is None and "More is missing on servo (2 mrad, 20 floors)" in far.summary
     lost = told_again(found, fit_of(9e-3, 0.25, 0.01), sizes, tmp_path)
     assert lost.verdict == "unknown" and lost.added == [] and lost.joints["servo"]["effects"] == ["quadratic_friction"]
-    assert "Hint on servo: quadratic_friction (coefficient 0.25 ± 0.01 N m s^2/rad^2). It is not named" in lost.summary
-    assert "as it explains 19 %" in lost.summary
+    (hint,) = (sentence for sentence in lost.evidence if sentence.startswith("Hint"))
+    assert hint.startswith("Hint on servo: quadratic_friction (coefficient 0.25 ± 0.01 N m s^2/rad^2) explains 19 %.")
+    assert hint.endswith("It is not named, as it leaves more than it explains.")
     assert not any(entry["added"] for entry in lost.ranking)
 
 

@@ -12,9 +12,9 @@ from run_folders import write_run
 
 from pace_actuators.effects import get_effect
 from pace_actuators.files import write_json
-from pace_actuators.text import size_text
+from pace_actuators.text import percent, size_text
+from pace_optim.commands.diagnose import run_and_tell
 from pace_optim.diagnosis import Diagnosis
-from pace_optim.diagnosis.findings.findings import percent_text
 from pace_optim.diagnosis.findings.text import lines_of, size_lines
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.verdict.sizes import factor_of, sizes
@@ -50,11 +50,21 @@ def test_a_size_is_told_with_its_error_bar_and_as_a_factor_where_it_is_one(chang
 
 
 @pytest.mark.parametrize(
-    ("share", "text"), [(0.876, "88"), (0.0042, "0.4"), (7e-7, "below 0.1"), (0.0, "below 0.1"), (-0.02, "-2")]
+    ("share", "text"),
+    [
+        (1.0, "100 %"),
+        (0.9999, "over 99.9 %"),
+        (0.9966, "99.7 %"),
+        (0.876, "88 %"),
+        (0.0042, "0.4 %"),
+        (7e-7, "below 0.1 %"),
+        (0.0, "0 %"),
+        (-0.02, "-2 %"),
+    ],
 )
 def test_a_share_is_told_as_a_person_reads_it(share, text):
-    """It said 7e-05 %."""
-    assert percent_text(share) == text
+    """It said 7e-05 %, and 100 % where joints were left at three floors."""
+    assert percent(share) == text
 
 
 def test_what_multiplies_what_was_stated_is_a_factor():
@@ -76,6 +86,27 @@ def test_the_verdict_is_printed_first_then_likes_and_advice_and_sizes_with_the_f
     assert size.startswith("  torque_gain.gain of knee: ") and size.endswith("times what was stated, at its bound")
 
 
+def test_a_command_prints_the_verdict_once_and_the_three_next_steps_last(tmp_path, monkeypatch, capsys):
+    """It stood before and after the fit of the whole robot."""
+    runs = [str(write_run(tmp_path / name)) for name in ("run", "refit")]
+    found = Diagnosis(
+        **make_diagnosis() | {"runs": runs, "paying": ["stribeck_friction"], "evidence": ["It explains."]}
+    )
+
+    def diagnosed(_, on_verdict):
+        on_verdict(found)
+        return found
+
+    monkeypatch.setattr("pace_optim.commands.diagnose.diagnose", diagnosed)
+    run_and_tell(None)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "each joint alone: effect, stribeck_friction; the fit of the whole robot decides"
+    assert lines.count(found.summary) == lines.count("It explains.") == lines.count("verdict: effect") == 1
+    assert [line.partition(":")[0] for line in lines[-5:]] == ["next", "next", "next", "report", "run"]
+    (row,) = (line for line in lines if line.startswith("  stribeck_friction"))
+    assert row.split(maxsplit=2)[1:] == ["added", "hip 4.30 -> 0.400, knee 4.30 -> 0.400, ankle 4.30 -> 0.400"]
+
+
 def test_the_report_opens_with_the_verdict_its_sizes_and_the_run_that_has_it(tmp_path):
     folder, refit = write_run(tmp_path / "run"), write_run(tmp_path / "refit")
     content = make_diagnosis() | {
@@ -89,11 +120,7 @@ def test_the_report_opens_with_the_verdict_its_sizes_and_the_run_that_has_it(tmp
     for page in pages:
         first = page.text.split("Error of each joint")[0]
         assert "Missing in this run: Stribeck friction at hip, knee, ankle" in first
-        assert (
-            "of joint_3: 3 ± 0.002" in first
-            and "and 2 more" in first
-            and "torque_gain cannot be separated from payload" in first
-        )
+        assert "stribeck_friction" in first and "torque_gain cannot be separated from payload" in first
     html = (folder / "report.html").read_text("utf-8"), (refit / "report.html").read_text("utf-8")
     assert 'href="../refit/report.html"' in html[0] and 'href="../run/report.html"' in html[1]
 

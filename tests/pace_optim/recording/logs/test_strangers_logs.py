@@ -281,7 +281,7 @@ def test_notes_come_once_for_each_kind():
         replace(recording(TIME, MOTION, TARGET), name=name, notes=tuple(note for n, note in notes if n == name))
         for name in "ab"
     ]
-    assert notes_by_kind(recordings) == ["a: Rate 400 Hz. (b: 399)", "a, b: Wraps."]
+    assert notes_by_kind(recordings) == ["a: Rate 400 Hz. (b: 399 Hz)", "a, b: Wraps."]
 
 
 @pytest.mark.skipif(not STRANGERS.is_dir(), reason="needs ../shared/cases")
