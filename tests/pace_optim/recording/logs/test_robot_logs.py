@@ -547,3 +547,25 @@ def test_a_trajectory_without_an_end_is_refused():
     message = SimpleNamespace(joint_names=["hip"], points=[point(0), point(10**9)])
     with pytest.raises(ValueError, match=r"/plan: a trajectory lasts 1e\+09 s, expected at most a day"):
         list(rows_of(message, "/plan"))
+
+
+def test_arrays_of_any_names_take_their_joints_from_an_array_of_texts(tmp_path):
+    time, joints = np.arange(400) / 200, ["hip", "knee"]
+    position = 0.3 * np.sin(2 * time)[:, None] * [1.0, 0.5]
+    arrays = {"t": time, "q": position, "q_des": position + 0.01, "joints": np.array(joints), "more": np.zeros(7)}
+    np.savez(tmp_path / "log.npz", **arrays)
+    (found,) = load_recordings(tmp_path / "log.npz")
+    assert found.joint_names == tuple(joints) and np.allclose(found.dof_pos, position)
+    assert np.allclose(found.des_dof_pos, position + 0.01)
+    np.savez(tmp_path / "unnamed.npz", **{key: arrays[key] for key in ("t", "q", "q_des")})
+    (found,) = load_recordings(tmp_path / "unnamed.npz", Robot(joint_names=joints))
+    assert found.joint_names == tuple(joints) and np.allclose(found.dof_pos, position)
+
+
+def test_german_names_are_read(tmp_path):
+    time = np.arange(0, 4000, 20)
+    rows = [f"{t};{30 * np.sin(0.002 * t):.3f};{30 * np.sin(0.002 * t):.3f}" for t in time]
+    (tmp_path / "log.csv").write_text("\n".join(["Zeit [ms];Knie Ist [deg];Knie Soll [deg]", *rows]))
+    (found,) = load_recordings(tmp_path / "log.csv")
+    assert found.joint_names == ("Knie",) and found.time[1] == pytest.approx(0.02)
+    assert np.allclose(found.des_dof_pos[:, 0], np.radians(30) * np.sin(0.002 * time), atol=1e-4)
