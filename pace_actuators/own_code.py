@@ -89,7 +89,8 @@ def loaded_module(module: str) -> ModuleType | None:
         return sys.modules.get(module)
     file = Path(module).resolve()
     own = file.stat() if file.exists() else None
-    others = (m for m in list(sys.modules.values()) if m.__name__ != "__main__" and (own is None or _is_at(m, own)))
+    modules = [m for m in list(sys.modules.values()) if isinstance(m, ModuleType)]  # Cython puts other objects there
+    others = (m for m in modules if m.__name__ != "__main__" and (own is None or _is_at(m, own)))
     return next((m for m in others if source_file(m) == file), None)
 
 

@@ -12,7 +12,7 @@ from command_lines import run_script
 from problems import BENCH, record
 
 from pace_actuators.effects import get_effect
-from pace_actuators.own_code import code_of, digest_of, import_named, import_recorded
+from pace_actuators.own_code import code_of, digest_of, import_named, import_recorded, loaded_module
 from pace_envs.rl.runner import read_checkpoint
 from pace_optim.identification.fit import fit
 from pace_optim.recording import save_recording
@@ -198,3 +198,9 @@ def test_a_module_that_is_named_wrongly_is_one_line():
     assert done.returncode == 2 and "'nowhere.py' cannot be imported" in done.stderr
     with pytest.raises(ValueError, match="has not been imported"):
         get_effect("nowhere.py:Drag")
+
+
+def test_what_other_libraries_put_among_the_modules_is_passed_over(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "cython.parallel", object())  # as Cython does
+    assert loaded_module(str(tmp_path / "own.py")) is None
+    assert loaded_module(__file__) is sys.modules[__name__]
