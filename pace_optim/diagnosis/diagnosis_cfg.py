@@ -112,9 +112,9 @@ class LinksCfg:
     """... until their neighbours are this near [m]."""
     step: float = 1e-2
     """Normalised step of the derivatives."""
-    tried: int = 4
+    tried: int = 6
     """Candidates of a round that are fitted, ..."""
-    of_link: int = 2
+    of_link: int = 3
     """and so many of them of one link."""
     iterations: int = 15
     """Of each fit, at most."""

@@ -206,7 +206,7 @@ def _best_addition(
     A load on the axis of a joint is the same on both sides of it: of those that leave the same, the outermost.
     """
     problem, fitted, alike = now.problem, list[tuple[int, _Fitted]](), cfg.judging.alike
-    for addition in sorted(screened.links[: cfg.links.tried], key=lambda each: len(each.names)):
+    for addition in sorted(screened.links, key=lambda each: len(each.names)):
         if any(size < len(addition.names) and each.rmse <= alike * noise for size, each in fitted):
             break
         sought = (*(each for each in found if each.link != addition.link), addition)
@@ -294,14 +294,20 @@ def _screened(now: _Fitted, found: tuple[Reference, ...], cfg: DiagnosisCfg) -> 
             )
             loads[each.link] = {name: {each.link: value} for name, value in zip(PARTS["load"], values, strict=True)}
             consider(explained, replace(each, names=PARTS["load"]))
-    links: list[Reference] = []
-    for _, each in sorted(promising, key=lambda each: -each[0]):
-        if sum(each.link == other.link for other in links) < cfg.links.of_link:
-            links.append(each)
+    links = listed_candidates(promising, cfg.links)
     order = tuple(each.link for each in every)
     alike = {effect: max(gains, key=gains.__getitem__) for effect, gains in on_joints.items() if gains}
     joint_of = {effect: joint for effect, joint in alike.items() if on_joints[effect][joint] > least}
     return _Screened(links, order, loads, joint_of)
+
+
+def listed_candidates(promising: Sequence[tuple[float, Reference]], cfg: LinksCfg) -> list[Reference]:
+    """What is fitted in a round, the most promising first: several parts of one link, and other links beside it."""
+    links: list[Reference] = []
+    for _, each in sorted(promising, key=lambda each: -each[0]):
+        if len(links) < cfg.tried and sum(each.link == other.link for other in links) < cfg.of_link:
+            links.append(each)
+    return links
 
 
 def _look(problem: Problem, x: torch.Tensor, cfg: LinksCfg) -> tuple[torch.Tensor, torch.Tensor, float]:

@@ -18,7 +18,7 @@ from pace_envs.identified import use_identified
 from pace_envs.link_inertia import NAMES, PARTS, POSITIVE, TEN, Reference
 from pace_envs.tasks.pace import PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg, sought_links
 from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg, LinksCfg
-from pace_optim.diagnosis.wrong_links import LinkFindings, WrongLink, _best_load, find_wrong_links
+from pace_optim.diagnosis.wrong_links import LinkFindings, WrongLink, _best_load, find_wrong_links, listed_candidates
 from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.error_bars.undetermined import undetermined
@@ -292,6 +292,14 @@ def test_a_load_s_place_is_read_and_refused_where_it_means_nothing():
 
 def test_nothing_is_sought_without_being_asked_for():
     assert env_cfg().sim2real.links == ()
+
+
+def test_all_parts_of_a_promising_link_are_fitted_and_other_links_beside_it():
+    """A load beyond Bolt's shin needs the third of its candidates; UR5e's tool is on the second link of the list."""
+    upper, fore = reference("upper"), reference("fore")
+    of_one = [(9.0 - i, dataclasses.replace(upper, names=TEN[: i + 1])) for i in range(5)]
+    listed = listed_candidates([(1.0, fore), *of_one], LinksCfg())
+    assert [len(each.names) for each in listed if each.link == "upper"] == [1, 2, 3] and listed[-1].link == "fore"
 
 
 def test_a_load_is_found_among_the_ten_parameters_of_its_link():
