@@ -171,6 +171,7 @@ def test_limits_and_dynamics_of_a_urdf_are_read_and_its_meshes_are_not_needed(tm
     assert drive.effort_limit == [23.7, 35.5] and drive.velocity_limit == [30.1, 20.1]
     assert any("meshes are not loaded" in note for note in cfg.sim2real.notes)
     assert any(note.startswith("gains: the file has none") for note in cfg.sim2real.notes)
+    assert any(note.startswith("effort limit: 23.7 to 35.5 N m") for note in cfg.sim2real.notes)
     env = made(cfg)
     robot = env.scene["robot"]
     assert robot.data.joint_pos_limits.tolist() == [[-1.5, 1.5], [-2.5, 0]]
