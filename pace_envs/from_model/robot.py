@@ -300,8 +300,8 @@ def _assumptions(joints: Sequence[JointFacts], key: str, model: mujoco.MjModel, 
     if limits := [joint.effort_limit for joint in joints if np.isfinite(joint.effort_limit)]:
         span = f"{min(limits):g}" if min(limits) == max(limits) else f"{min(limits):g} to {max(limits):g}"
         notes.append(
-            f"effort limit: {span} N m (slides: N), the file's; it cuts the torques. If it is a guess, state effort_limit "
-            "beside the log, or find it with --unknown effort_limit"
+            f"effort limit: {span} N m (slides: N), the file's; it cuts the torques. If it is a guess, state "
+            "effort_limit beside the log, or find it with --unknown effort_limit"
         )
     if not any(np.isfinite(joint.velocity_limit) for joint in joints):
         notes.append("speed limit: none")
