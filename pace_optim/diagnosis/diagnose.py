@@ -183,7 +183,8 @@ def _refit(
     except KeyboardInterrupt:
         how = f": {command('fit')} --resume {shlex.quote(str(begun[0]))} goes on with it" if begun else ""
         progress.close()
-        progress.say(f"the fit of the whole robot was broken off{how}; the diagnosis above stands")
+        progress.say(f"the fit of the whole robot was broken off{how}; the diagnosis stands")
+        progress.close()
         return None
     progress.close()
     return path
