@@ -79,6 +79,23 @@ def test_what_a_drive_does_otherwise_is_a_warning(tmp_path):
     assert "--unknown effort_limit" in " ".join(checked(problem).contradictions)
 
 
+def test_a_limit_that_the_motion_refutes_is_said_before_the_search(tmp_path):
+    """Beside missing physics too: another joint carries a spring that the model does not have."""
+    made = inputs.make("clean", 0)
+    drive, position = made.recording.drive, made.recording.dof_pos
+    pull = np.zeros_like(position)
+    pull[:, 1] = 0.3 * drive.stiffness[1] * (position[:, 1] - position[:, 1].mean())
+    target = made.recording.des_dof_pos + pull / drive.stiffness
+    asked = np.abs(drive.stiffness * (target - position)).max(axis=0)
+    limit = np.array([0.2 * asked[0], *(10 * asked[1:])])
+    recording = replace(made.recording, des_dof_pos=target, drive=replace(drive, effort_limit=limit))
+    said: list[str] = []
+    problem = checked(inputs.problem_of(replace(made, recording=recording), tmp_path), trust=True, tell=said.append)
+    (warning,) = (each for each in said if "State the real effort_limit" in each)
+    assert warning.startswith("warning: ") and made.recording.joint_names[0] in warning
+    assert warning.removeprefix("warning: ") in problem.contradictions
+
+
 def test_every_bound_is_kept_and_little_is_lost_by_it():
     rng = np.random.default_rng(0)
     for _ in range(50):
