@@ -302,21 +302,22 @@ def by_chords(
         tolerance: The part of the score that a step gains at least.
 
     Returns:
-        Where they lead, the residuals there with these derivatives, and whether the last step still gained.
+        Where they lead, the residuals there with these derivatives, and whether that is an end: by the derivatives,
+        less than the tolerance is left to gain.
     """
     descent = Descent(x=x, damping=_SLIGHT, scores=[float(there.residuals.score[0])])
     hessian, gradient = there.normal_equations()
     for _ in range(_CHORDS):
         step = Step(descent, hessian, gradient, _FEW)
+        if step.expected <= tolerance * descent.score:
+            return descent.x, there, True
         gained, residuals = step.take(evaluator)
         if gained > 0:
             there = replace(there, residuals=residuals)
             gradient = there.gradient_at(descent.x, residuals.error[0])
-        if gained <= tolerance * descent.score:
-            return descent.x, there, False
         if gained < _AS_EXPECTED * step.expected:
             break
-    return descent.x, there, True
+    return descent.x, there, False
 
 
 def _creeps(scores: Sequence[float], cfg: LeastSquaresCfg) -> bool:

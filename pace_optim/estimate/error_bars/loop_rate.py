@@ -250,8 +250,8 @@ def _refitted(
     begin = evaluator.residuals(space.to_physical(x)[None])
     if not bool(begin.score.isfinite()):
         return None
-    x, near, gains = by_chords(evaluator, x, replace(there, residuals=begin), _LEFT)
-    if gains:
+    x, near, is_end = by_chords(evaluator, x, replace(there, residuals=begin), _LEFT)
+    if not is_end:
         hessian, _ = near.normal_equations()
         x = least_squares(evaluator, there.colouring, [Descent(x=x, hessian=hessian)], _REFIT)[0].x
         near = replace(near, residuals=evaluator.residuals(space.to_physical(x)[None]))

@@ -55,6 +55,19 @@ def test_a_rate_that_fits_best_is_compared_with_the_others_too():
     assert rates.chosen == 0.0005 and len(rates.periods) > 3
 
 
+def test_a_rate_is_fitted_to_its_end_where_the_derivatives_of_the_fit_do_not_serve():
+    """A step that gained nothing passed for an end: the right rate was refused, and wrong values had small bars."""
+    problem = recorded_at(0.001).with_drive_dt(0.0005)
+    problem = dataclasses.replace(problem, assumed_loop=problem.loop_dt)
+    x, known = fitted(problem)
+    shown = ~np.isnan(known.uncertainty.std)
+    right = loop_rates(problem, x, known.jacobian, shown)
+    wrong = dataclasses.replace(known.jacobian, columns=0.2 * known.jacobian.columns)  # steps five times too long
+    rates = loop_rates(problem, x, wrong, shown)
+    assert rates.chosen == right.chosen
+    np.testing.assert_allclose(rates.values, right.values, rtol=2e-2, atol=1e-4)
+
+
 @pytest.mark.parametrize("physics_dt", [0.0025, 0.0005])
 def test_the_error_bars_hold_a_rate_that_a_log_with_gains_does_not_state(physics_dt):
     """Viscous friction was 53 % high with an error bar of 0.5 %, as a log that states gains seemed to state all."""
