@@ -99,7 +99,7 @@ class LinksCfg:
 
     explains: float = 0.3
     """A link is fitted if it would explain this part of the squared error above the noise, to first order, and is kept
-    if it does: each of three wrong links may."""
+    if it does: each of three wrong links may. So much must an iteration of a look-alike, far above what links leave."""
     same: float = 1.01
     """Errors up to this ratio apart are the same: of as many parameters, those of the outermost link are taken."""
     share: float = 0.25

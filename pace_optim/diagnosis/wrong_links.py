@@ -147,13 +147,12 @@ def find_wrong_links(
     part = (base.rmse**2 - now.rmse**2) / max(base.rmse**2 - noise**2, 1e-300)
     if now.rmse > cfg.judging.far * noise or part < cfg.verdict.most:
         return LinkFindings()
-    say("fitting the links that may be wrong")
     joint_of, left = joint_of or {}, max(now.rmse, noise)
-    likes = _look_alikes(base, {effect: [joint] for effect, joint in joint_of.items()}, own)
-    better = list(likes.values())
+    likes = _look_alikes(base, {effect: [joint] for effect, joint in joint_of.items()}, left, say, own)
+    better = likes
     if left > alike * noise:  # more is missing: an effect on every joint may be what the links stand for
-        better += _look_alikes(base, dict.fromkeys(joint_of, problem.joint_names), own).values()
-    if any(rmse * alike < left for rmse in better):
+        better = likes | _look_alikes(base, dict.fromkeys(joint_of, problem.joint_names), left, say, own)
+    if any(rmse * alike < left for rmse in better.values()):
         return LinkFindings()
     if likes := {name: rmse for name, rmse in likes.items() if rmse <= alike * left}:
         names = ", ".join(reference.link for reference in found)
@@ -386,15 +385,22 @@ def _best_load(
     return float(falls[k]), [float(masses[k]), *best[k].tolist()]
 
 
-def _look_alikes(base: _Fitted, joints_of: Mapping[str, Sequence[str]], cfg: LinksCfg) -> dict[str, float]:
+def _look_alikes(
+    base: _Fitted, joints_of: Mapping[str, Sequence[str]], left: float, say: Callable[[str], None], cfg: LinksCfg
+) -> dict[str, float]:
     """The error with each effect on some joints, {effect on joints: RMSE [rad]}.
 
-    An effect of a size that no drive has is not like a link.
+    An effect of a size that no drive has is not like a link. A fit far above what links leave ends early.
+
+    Args:
+        left: The error with links [rad].
     """
     found, values = dict[str, float](), _values_of(base)
     for effect, joints in joints_of.items():
+        say(f"fitting {effect} on {plural(len(joints), 'joint')} in place of the links")
         there = "|".join(map(re.escape, joints))
-        fitted = _fit(base.problem.with_effects([*base.problem.effects, f"{effect}@{there}"]), values, cfg)
+        problem = base.problem.with_effects([*base.problem.effects, f"{effect}@{there}"])
+        fitted = _fit(problem, values, cfg, left=left)
         sizes = _values_of(fitted)
         own = [(p, sizes[f"{effect}.{p.name}"][joint]) for p in get_effect(effect).parameters for joint in joints]
         if all(p.is_plausible(size) for p, size in own):
@@ -402,11 +408,25 @@ def _look_alikes(base: _Fitted, joints_of: Mapping[str, Sequence[str]], cfg: Lin
     return found
 
 
-def _fit(problem: Problem, values: Mapping[str, Mapping[str, float]], cfg: LinksCfg, *, whole: bool = False) -> _Fitted:
-    """The problem fitted from near, on pieces, or on all that is trained on."""
+def _fit(
+    problem: Problem,
+    values: Mapping[str, Mapping[str, float]],
+    cfg: LinksCfg,
+    *,
+    whole: bool = False,
+    left: float | None = None,
+) -> _Fitted:
+    """The problem fitted from near, on pieces, or on all that is trained on.
+
+    Args:
+        left: The error of a rival [rad]. The fit ends where it gains little and is far above; ``None``: of the noise.
+    """
     near = LeastSquaresCfg(
         max_iteration=cfg.iterations, score_tolerance=cfg.tolerance, noise_score=noise_score(problem)
     )
+    if left is not None:
+        near.noise_score = left**2 * len(problem.joint_names)
+        near.loosest_tolerance = near.loosest_enough = cfg.explains
     stage = problem if whole else problem.on_pieces(cfg.share)
     start = _values_in(problem, values)
     x = least_squares(stage.training_evaluator(), _colouring(problem), [start], near)[0].x

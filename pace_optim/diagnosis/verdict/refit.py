@@ -13,6 +13,7 @@ from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.selection.naming import Evidence
 from pace_optim.diagnosis.verdict.names import Hint, harm_of, hint
 from pace_optim.diagnosis.verdict.sizes import error_bars_from_none
+from pace_optim.estimate.error_bars.uncertainty import SURE
 from pace_optim.joints.fits.block_errors import BlockErrors
 from pace_optim.joints.fits.fitted import Fitted
 from pace_optim.run.result import FitResult
@@ -36,7 +37,8 @@ def judged_again(
 
     Errors, sizes and their error bars are those of that fit. The error without an effect is the lower one of the joint
     alone and the run. A fit far above the noise has no error bars; those of the joint alone stand then. A joint
-    that is near the floor in the run needs no hint.
+    that is near the floor in the run needs no hint. Nor does one that ends there with a size that is not significant,
+    where other effects stand: these explain its error.
 
     Args:
         outcome: With the whole robot's errors and values.
@@ -49,9 +51,10 @@ def judged_again(
     std = _entries(outcome, joint_names, refit.std, torch.zeros_like(now.physical))
     bars = error_bars_from_none(now, std)
     stuck, implausible = now.model.has_at_bounds(now.x, now.moves), now.model.implausible(now.physical)
-    harm, far = harm_of(outcome), before.sqrt() > outcome.cfg.judging.far * floor
+    harm, (far, stays_far) = harm_of(outcome), (mse.sqrt() > outcome.cfg.judging.far * floor for mse in (before, after))
     stand: dict[tuple[type[Effect], int], Evidence] = {}
     hints: list[Hint] = []
+    vanished: list[Hint] = []
     for row, effect in enumerate(now.model.effects):
         evidence = {
             j: replace(
@@ -72,7 +75,9 @@ def judged_again(
                 stand[effect, j] = evidence[j]
             elif bool(far[j]):
                 hints.append(told)
-    return stand, hints
+                if not stays_far[j] and 0 < evidence[j].bars < SURE:
+                    vanished.append(told)
+    return stand, [each for each in hints if not stand or each not in vanished]
 
 
 def _errors(result: FitResult, joint_names: Sequence[str]) -> BlockErrors:
