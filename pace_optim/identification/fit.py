@@ -13,9 +13,8 @@ from pace_actuators.text import listed
 from pace_envs.task_source import EnvironmentRecord
 from pace_optim.estimate.own_objective import optimizer_modules, use_recorded_optimizer
 from pace_optim.estimate.search import agree_to_stop, search
-from pace_optim.identification.conclude import conclude
+from pace_optim.identification.conclude import conclude, conclude_own
 from pace_optim.identification.optimization import Optimization, with_structures
-from pace_optim.identification.own_objective import conclude_own
 from pace_optim.identification.setup import load_for_fit, make_optimizer, make_searcher
 from pace_optim.problem.recordings import tell_nobody, tell_on_stderr
 from pace_optim.recording.torque import NoTorqueError

@@ -7,7 +7,7 @@ from problems import chirp, make_problem, record
 
 from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.least_squares import Descent, checkpoint_of
-from pace_optim.estimate.way_down import WayDown
+from pace_optim.estimate.way_down import WayDown, WayDownCfg
 
 
 def main() -> None:
@@ -18,8 +18,9 @@ def main() -> None:
     colouring = colour(problem.space, problem.trees, problem.joint_names)
 
     def way(**options):
-        pieces = problem.on_pieces(0.25).training_evaluator()
-        return WayDown(problem.training_evaluator(), colouring, pieces=pieces, **options)
+        result = WayDown(problem, colouring, cfg=WayDownCfg(share=0.25), **options)
+        result.noise_score = 0.0
+        return result
 
     kept: list = []
     whole = way(on_iteration=lambda _: kept.append(checkpoint_of(first.descents)))

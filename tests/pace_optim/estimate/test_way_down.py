@@ -1,4 +1,4 @@
-"""The way down: on pieces, elsewhere where these end above the noise, on the whole; and resumed."""
+"""The way down: on pieces, by a search where these end above the noise, on the whole; and resumed."""
 
 import pytest
 import torch
@@ -34,9 +34,11 @@ def test_pieces_are_a_share_of_the_windows_of_each_recording():
     assert all(bool(each) for each in pieces.train.any(dim=0))
 
 
-def way(problem, colouring, **options):
-    pieces = problem.on_pieces(0.25).training_evaluator()
-    return WayDown(problem.training_evaluator(), colouring, **{"pieces": pieces, **options})
+def way(problem, colouring, noise_score=0.0, on_pieces=None, **options):
+    cfg = WayDownCfg(share=0.25, **({} if on_pieces is None else {"on_pieces": on_pieces}))
+    result = WayDown(problem, colouring, cfg=cfg, **options)
+    result.noise_score = noise_score
+    return result
 
 
 def test_it_ends_at_the_truth_with_fewer_steps_than_least_squares_alone(problem, colouring):
@@ -84,7 +86,7 @@ def test_the_derivatives_of_the_error_bars_lead_from_beside_the_minimum_into_it(
 def test_it_is_searched_only_where_the_pieces_end_above_the_noise(problem, colouring, noise):
     """A descent that stops at once stands for one that ends in a wrong valley."""
     stuck = LeastSquaresCfg(max_iteration=1)
-    staged = way(problem, colouring, noise_score=noise, cfg=WayDownCfg(on_pieces=stuck))
+    staged = way(problem, colouring, noise_score=noise, on_pieces=stuck)
     budgets = []
 
     def search(budget, around):
@@ -100,7 +102,7 @@ def test_it_is_searched_only_where_the_pieces_end_above_the_noise(problem, colou
 @pytest.mark.parametrize("missing", [0.0, 1.0])
 def test_it_is_not_searched_where_missing_physics_leaves_as_much(problem, colouring, missing):
     stuck = LeastSquaresCfg(max_iteration=1)
-    staged = way(problem, colouring, noise_score=1e-12, cfg=WayDownCfg(on_pieces=stuck))
+    staged = way(problem, colouring, noise_score=1e-12, on_pieces=stuck)
     staged.missing_score = missing
     searched = []
     staged.run([torch.full_like(centre(problem), 0.9)], lambda *_: searched.append(0) or [])
