@@ -20,7 +20,7 @@ from walking_plant import CONTROL, crawler, drawn, gait
 from pace_envs import load_env_cfg
 from pace_optim.estimate.derivatives import colour, stencil
 from pace_optim.estimate.error_bars.assessment import assess
-from pace_optim.estimate.error_bars.undetermined import change_without_step, step_share
+from pace_optim.estimate.error_bars.physics_step import change_without_step, step_share
 from pace_optim.problem.problem import Problem, load_problem
 
 COVERED = 2.0

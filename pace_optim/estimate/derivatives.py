@@ -18,8 +18,9 @@ rattles is a small part of each change, also along a combination of parameters t
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 
@@ -53,6 +54,16 @@ class Colouring:
     """For each entry of the vector, the indices of the joints that it moves."""
     sensors: tuple[int, ...] = ()
     """Entries that change what sensors show, and no motion: each is perturbed without the others of its tree."""
+
+    @cached_property
+    def row_of(self) -> dict[int, int]:
+        """The colour of each entry that is not fixed, which is its row of a Jacobian."""
+        return {entry: c for c, entries in enumerate(self.colours) for entry in entries}
+
+    def moving(self, joints: Iterable[int]) -> list[int]:
+        """Entries that move any of some joints."""
+        own = set(joints)
+        return [entry for entry in self.row_of if own & set(self.joints[entry])]
 
 
 def colour(space: ParameterSpace, trees: Sequence[Sequence[str]], joint_names: Sequence[str]) -> Colouring:
@@ -96,10 +107,9 @@ class Stencil:
         colouring = self.colouring
         change = residuals.error[1 : 1 + len(colouring.colours)] - residuals.error[:1]
         columns = torch.zeros_like(change)
-        row_of = {entry: c for c, entries in enumerate(colouring.colours) for entry in entries}
         for joint in range(change.shape[-1]):
-            entries = [entry for entry in row_of if joint in colouring.joints[entry]]
-            rows, at = [row_of[entry] for entry in entries], torch.tensor(entries)
+            entries = colouring.moving([joint])
+            rows, at = [colouring.row_of[entry] for entry in entries], torch.tensor(entries)
             length = self.steps[at[:, None], at].norm(dim=1).clamp(min=1e-300)
             changes = change[rows, ..., joint].flatten(1) / length[:, None]
             known = changes.isfinite().all(dim=1, keepdim=True)  # a vector may diverge: its direction is left out
@@ -210,11 +220,9 @@ class Jacobian:
     def column(self, entry: int) -> torch.Tensor:
         """Derivative of the error by an entry, (K, R, n); zero for joints that the entry does not move."""
         result = torch.zeros_like(self.residuals.error[0])
-        row = next((c for c, entries in enumerate(self.colouring.colours) if entry in entries), None)
-        if row is None:  # its bounds are equal
-            return result
-        joints = list(self.colouring.joints[entry])
-        result[..., joints] = self.columns[row][..., joints]
+        if entry in self.colouring.row_of:  # else its bounds are equal
+            joints = list(self.colouring.joints[entry])
+            result[..., joints] = self.columns[self.colouring.row_of[entry]][..., joints]
         return result
 
     def times(self, vector: torch.Tensor) -> torch.Tensor:
@@ -244,7 +252,7 @@ class Jacobian:
         """JᵀJ (size, size) and Jᵀr (size,) with the prior's, divided by the number of samples as the score is."""
         size = len(self.colouring.joints)
         hessian, gradient = torch.zeros(size, size, dtype=torch.float64), torch.zeros(size, dtype=torch.float64)
-        row_of = {entry: c for c, entries in enumerate(self.colouring.colours) for entry in entries}
+        row_of = self.colouring.row_of
         for joint in range(self.columns.shape[-1]):
             entries = [entry for entry in range(size) if joint in self.colouring.joints[entry]]
             # products are rounded by layout: contiguous, they are the same whatever these are views of
@@ -255,6 +263,6 @@ class Jacobian:
             hessian[at[:, None], at] += block @ block.T
             gradient[at] += block @ error
         if (prior := self.residuals.prior) is not None:
-            hessian, gradient = hessian + prior.hessian, gradient + prior.gradient
+            hessian, gradient = hessian + prior.hessian, gradient + prior.gradient_at(prior.x[0])
         samples = self.residuals.where.sum()
         return hessian / samples, gradient / samples

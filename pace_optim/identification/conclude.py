@@ -19,15 +19,9 @@ from pace_optim.estimate.error_bars.assessment import Assessment, assess, trajec
 from pace_optim.estimate.error_bars.consistency import Consistency, check_consistency
 from pace_optim.estimate.error_bars.far_from_noise import FAR_ABOVE_NOISE, far_end, times_noise
 from pace_optim.estimate.error_bars.loop_rate import LoopRates, loop_rates, used_loop
+from pace_optim.estimate.error_bars.physics_step import change_without_step, step_share
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty
-from pace_optim.estimate.error_bars.undetermined import (
-    DELAY,
-    change_without_step,
-    held_at_prior,
-    step_share,
-    undetermined,
-    without_delay,
-)
+from pace_optim.estimate.error_bars.undetermined import DELAY, held_at_prior, undetermined, without_delay
 from pace_optim.estimate.error_bars.warnings import by_effect, fit_warnings, rough_motion
 from pace_optim.estimate.least_squares import LeastSquaresCfg
 from pace_optim.estimate.own_objective import Objective, objective_error_bars, optimizer_class

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -40,11 +39,6 @@ class Prior:
     def penalty(self) -> torch.Tensor:
         """What it adds to the sum of squared errors, (m,) [rad²]."""
         return self.noise * (self.x.square() @ self.precision)
-
-    @property
-    def gradient(self) -> torch.Tensor:
-        """Half of its derivative at the first candidate, (size,) [rad²]."""
-        return self.gradient_at(self.x[0])
 
     def gradient_at(self, x: torch.Tensor) -> torch.Tensor:
         """Half of its derivative, (size,) [rad²], at a candidate (size,)."""
@@ -147,9 +141,6 @@ class Evaluator:
         self._make_env = make_env
         self._nearby = nearby
         self._rollouts: dict[int, Rollout] = {}
-        self.simulations = 0
-        """Candidates simulated so far by :meth:`residuals`."""
-        self._again = 0
 
     @property
     def looks_coarser(self) -> bool:
@@ -159,17 +150,8 @@ class Evaluator:
     @property
     def simulated_steps(self) -> int:
         """Control steps simulated so far, over all environments."""
-        own = sum(rollout.simulated_steps for rollout in self._rollouts.values()) - self._again
+        own = sum(rollout.simulated_steps for rollout in self._rollouts.values())
         return own if self._nearby is None else own + self._nearby.simulated_steps
-
-    @contextlib.contextmanager
-    def again(self) -> Iterator[None]:
-        """What is simulated in the block was counted before: a run that goes on finds again what it had not kept."""
-        before = self.simulated_steps
-        try:
-            yield
-        finally:
-            self._again += self.simulated_steps - before
 
     def rollout(self, num_candidates: int) -> Rollout:
         """The rollout of that many candidates."""
@@ -218,7 +200,6 @@ class Evaluator:
             initial_offset: Added to each recording's first position, (m, n) [rad].
         """
         self.look_at_phases(physical[0])
-        self.simulations += len(physical)
         widest = max(1, _WIDEST // self.dataset.num_recordings)
         offsets = [None] * len(physical) if initial_offset is None else initial_offset.split(widest)
         parts = [
@@ -238,8 +219,9 @@ class Evaluator:
         Returns:
             Whether errors are others from now on.
         """
-        known = self.phases is not None and (self._phases_at is None or not anew)
-        if self.dataset.carried is None or known or (anew and _same(self._phases_at, physical)):
+        at = self._phases_at
+        known = self.phases is not None and (at is None or not anew)
+        if self.dataset.carried is None or known or (anew and at is not None and torch.equal(at, physical)):
             return False
         for each in (self, self._nearby):
             if each is not None:
@@ -345,7 +327,3 @@ class Evaluator:
             self._noise = max(noise_variance(trained), LEAST_NOISE**2)
         x = self.space.to_normalised(physical.to("cpu", torch.float64))
         return Prior(x=x, precision=std.pow(-2), noise=self._noise)
-
-
-def _same(one: torch.Tensor | None, other: torch.Tensor) -> bool:
-    return one is not None and torch.equal(one, other)

@@ -40,6 +40,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
+from scipy import ndimage
 
 from pace_optim.recording.moving_base import Carried
 
@@ -196,9 +197,9 @@ def blocks_of(carried: Carried, trees: Sequence[Sequence[int]]) -> tuple[Block, 
     result = []
     for r in carried.moves.nonzero()[:, 0].tolist():
         for tree in trees:
-            free = carried.free[:, r, list(tree)].all(dim=1).numpy().astype(int)
-            edges = np.flatnonzero(np.diff(np.concatenate([[0], free, [0]])))
-            for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+            free = carried.free[:, r, list(tree)].all(dim=1).numpy()
+            for (phase,) in ndimage.find_objects(ndimage.label(free)[0]):
+                first, end = phase.start, phase.stop
                 parts = max(1, round((end - first) / _BLOCK))
                 cuts = [first + (end - first) * i // parts for i in range(parts + 1)]
                 result += [

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -228,7 +228,7 @@ class Rollout:
         Args:
             at: Control steps of the samples, ascending, the last one that counts among them.
         """
-        reading = self._reading(self.duration_steps)
+        reading = self.reading(self.duration_steps)
         if reading is None:
             return self._in_one_go(at)
         return self._shown(reading, at, lambda steps: self._in_one_go(torch.arange(steps)))
@@ -251,7 +251,7 @@ class Rollout:
             torques.append(torch.zeros(shape, dtype=self.env.dtype))
             return self._in_one_go(torch.arange(steps + beyond), torque=torques[0])[:steps]
 
-        lag, reading = self.observation_lag(last), self._reading(last)
+        lag, reading = self.observation_lag(last), self.reading(last)
         positions = simulated(last)[at] if reading is None else self._shown(reading, at, simulated)
         after = after if offset is None else after + offset[at]
         when = torch.stack([self._rows(each[:, None]) for each in at[:, None] + after]).expand_as(positions)
@@ -322,7 +322,7 @@ class Rollout:
             simulated: Gives the positions at so many control steps; ``None``: :meth:`simulated`.
         """
         simulated, steps = simulated or self.simulated, self.duration_steps
-        reading = self._reading(steps)
+        reading = self.reading(steps)
         if reading is None:
             yield from enumerate(simulated(steps))
             return
@@ -335,19 +335,19 @@ class Rollout:
                 seen[:] = position
             if (k := j - reading.ahead) >= 0:
                 shown = seen[k % length].clone()
-                at = self._taken_at(reading, torch.tensor([k], device=self.env.device))
+                at = reading.taken_at(torch.tensor([k], device=self.env.device), reading.late)
                 shown[reading.late] = between_steps(seen[:, reading.late], at, ring=True)[0]
                 yield k, shown
 
-    def _shown(self, reading: _Reading, at: torch.Tensor, simulated: Callable[[int], torch.Tensor]) -> torch.Tensor:
+    def _shown(self, reading: Reading, at: torch.Tensor, simulated: Callable[[int], torch.Tensor]) -> torch.Tensor:
         """The same at some steps, read between those that are simulated at once, (len(at), num_envs, n) [rad]."""
         seen = simulated(self.duration_steps + reading.ahead)
         shown, own = seen[at], seen[:, reading.late]
         for rows in torch.arange(len(at)).split(_READ_AT_ONCE):
-            shown[rows[:, None], reading.late] = between_steps(own, self._taken_at(reading, at[rows]))
+            shown[rows[:, None], reading.late] = between_steps(own, reading.taken_at(at[rows], reading.late))
         return shown
 
-    def _reading(self, steps: int) -> _Reading | None:
+    def reading(self, steps: int) -> Reading | None:
         """How samples are taken between steps; ``None``: at the steps themselves."""
         lag, offset = self.observation_lag(steps), self.dataset.sample_offset
         if lag is None and offset is None:
@@ -356,20 +356,14 @@ class Rollout:
             lag = torch.zeros(2, self.env.num_envs, self.robot.num_joints, dtype=self.env.dtype, device=self.env.device)
         most = 0.0 if offset is None else float(offset.abs().max())
         moved = (lag != 0).any(dim=2).any(dim=0)
-        late = (moved if offset is None else torch.ones_like(moved)).nonzero()[:, 0]
-        return _Reading(
-            late=late,
-            first=lag[0, late],
-            rate=(lag[-1, late] - lag[0, late]) / max(1, steps - 1),
+        return Reading(
+            late=(moved if offset is None else torch.ones_like(moved)).nonzero()[:, 0],
+            first=lag[0],
+            rate=(lag[-1] - lag[0]) / max(1, steps - 1),
+            offset=offset,
             ahead=max(0, math.ceil(most - float(lag.min()))) + 2,
             behind=max(0, math.ceil(most + float(lag.max()))) + 2,
         )
-
-    def _taken_at(self, reading: _Reading, steps: torch.Tensor) -> torch.Tensor:
-        """When the late samples of some steps are taken, (len(steps), late, n) [control steps]."""
-        k = steps[:, None, None].to(self.env.dtype)
-        at, offset = k - (reading.first + reading.rate * k), self.dataset.sample_offset
-        return at if offset is None else at + offset[steps].repeat(1, self.num_candidates)[:, reading.late, None]
 
     def observation_lag(self, steps: int) -> torch.Tensor | None:
         """How late the first and the last sample are [control steps], (2, num_envs, n); ``None``: never."""
@@ -531,18 +525,31 @@ class Rollout:
             self.robot.add_body_mass(body, mass, rows, place=recording.load.added_mass_at.get(body))
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Reading:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reading:
     """Samples of step k are taken at k - lag + offset: some steps are simulated ahead, some are remembered."""
 
     late: torch.Tensor
     """Environments whose samples are not taken at the steps."""
     first: torch.Tensor
-    """Their lag at the first step, (late, n) [control steps]."""
+    """The lag of each environment at the first step, (num_envs, n) [control steps]."""
     rate: torch.Tensor
     """What it grows by with each: lags are linear in time."""
+    offset: torch.Tensor | None
+    """Of the recordings, (T, R)."""
     ahead: int
     behind: int
+
+    def taken_at(self, steps: torch.Tensor, envs: torch.Tensor) -> torch.Tensor:
+        """When samples of some steps are taken in some environments, (len(steps), len(envs), n) [control steps]."""
+        k = steps[:, None, None].to(self.first.dtype)
+        at = k - (self.first[envs] + self.rate[envs] * k)
+        return at if self.offset is None else at + self.offset[steps][:, envs % self.offset.shape[1], None]
+
+    def to(self, device: torch.device) -> Reading:
+        """The same on a device."""
+        own = {name: each.to(device) for name, each in vars(self).items() if isinstance(each, torch.Tensor)}
+        return replace(self, **own)
 
 
 def _changes(enable: torch.Tensor | None) -> frozenset[int]:

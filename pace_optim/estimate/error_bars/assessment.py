@@ -144,7 +144,6 @@ def _middle_of_swings(jacobian: Jacobian, phases: FreePhases, trained: torch.Ten
         trained: Where these samples are, (T, R) bool.
     """
     residuals, colouring = jacobian.residuals, jacobian.colouring
-    row = {entry: c for c, entries in enumerate(colouring.colours) for entry in entries}
     total = np.zeros((len(colouring.joints), len(colouring.joints)))
     if residuals.weight is None:
         return total
@@ -155,8 +154,8 @@ def _middle_of_swings(jacobian: Jacobian, phases: FreePhases, trained: torch.Ten
             continue
         at, rows = torch.arange(begin, end)[kept], kept[:, None].expand(-1, len(joints)).flatten()
         scale = (residuals.weight[at, r][:, joints] * phases.floor[r, joints]).flatten()
-        entries = [entry for entry in row if set(joints) & set(colouring.joints[entry])]
-        own = jacobian.columns[[row[entry] for entry in entries]][:, at, r][..., joints].flatten(1) * scale
+        entries = colouring.moving(joints)
+        own = jacobian.columns[[colouring.row_of[entry] for entry in entries]][:, at, r][..., joints].flatten(1) * scale
         error = residuals.error[0, at, r][:, joints].flatten() / scale.clamp(min=1e-300)
         spread = expected[rows][:, rows]
         larger = max(1.0, float(error.square().sum() / spread.diagonal().sum()))

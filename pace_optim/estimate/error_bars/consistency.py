@@ -246,7 +246,7 @@ def _by_promise(problem: Problem, x: torch.Tensor) -> tuple[list[int], int]:
     around = stencil(x, colouring)
     there = around.jacobian(evaluator.residuals(problem.space.to_physical(torch.cat([x[None], around.vectors]))))
     gains = {problem.space.slices[name].start for name in _GAINS.values()}
-    rows = [c for c, entries in enumerate(colouring.colours) if gains & set(entries)]
+    rows = sorted({colouring.row_of[entry] for entry in gains})
     falls = []
     for r in range(problem.dataset.num_recordings):
         columns = there.columns.clone()

@@ -189,15 +189,14 @@ def inverse_of(hessian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _middle(jacobian: Jacobian) -> np.ndarray:
     """JᵀΣJ, (size, size)."""
     residuals, colouring = jacobian.residuals, jacobian.colouring
-    size, row = len(colouring.joints), _row_of(colouring)
-    total = np.zeros((size, size))
+    total = np.zeros((len(colouring.joints), len(colouring.joints)))
     for r in range(residuals.where.shape[1]):
         at = residuals.where[:, r]
         if not bool(at.any()):
             continue
         for joint in range(residuals.error.shape[-1]):
-            own = [entry for entry in row if joint in colouring.joints[entry]]
-            columns = jacobian.columns[[row[entry] for entry in own]][:, at, r, joint].numpy()
+            own = colouring.moving([joint])
+            columns = jacobian.columns[[colouring.row_of[entry] for entry in own]][:, at, r, joint].numpy()
             error = residuals.error[0, at, r, joint].numpy()
             total[np.ix_(own, own)] += columns @ filtered(columns, autocovariance(error)).T
     return total
@@ -208,10 +207,10 @@ def _from_first_sample(
 ) -> np.ndarray:
     """JᵀSSᵀJ σ², S the derivative by a joint's first position and σ² the variance of its samples' white noise."""
     residuals, colouring = jacobian.residuals, jacobian.colouring
-    size, row = len(colouring.joints), _row_of(colouring)
-    total = np.zeros((size, size))
+    total = np.zeros((len(colouring.joints), len(colouring.joints)))
     for tree in dict.fromkeys(_tree_of(joint, colouring) for joints in initial_joints for joint in joints):
-        own = [entry for entry in row if set(tree) & set(colouring.joints[entry])]
+        own = colouring.moving(tree)
+        rows = [colouring.row_of[entry] for entry in own]
         sets = [(i, joint) for i, joints in enumerate(initial_joints) for joint in joints if joint in tree]
         for r in range(residuals.num_recordings):
             at = residuals.where[:, r]
@@ -219,7 +218,7 @@ def _from_first_sample(
                 continue
             effect = np.zeros((len(own), len(sets)))
             for column, joint in itertools.product(residuals.columns_of(r), tree):
-                columns = jacobian.columns[[row[entry] for entry in own], :, column, joint]
+                columns = jacobian.columns[rows, :, column, joint]
                 effect += (columns @ initial[[i for i, _ in sets], :, column, joint].T).numpy()
             error = residuals.error[0, at, r][:, [joint for _, joint in sets]]
             effect *= (0.5 * error.diff(dim=0).square().mean(dim=0)).sqrt().numpy()
@@ -230,11 +229,6 @@ def _from_first_sample(
 def _tree_of(joint: int, colouring: Colouring) -> tuple[int, ...]:
     """What a joint moves: the joints of the entries that move it and not all joints."""
     return min((moved for moved in colouring.joints if joint in moved), key=len, default=())
-
-
-def _row_of(colouring: Colouring) -> dict[int, int]:
-    """The Jacobian's row of each entry that is not fixed."""
-    return {entry: c for c, entries in enumerate(colouring.colours) for entry in entries}
 
 
 def autocovariance(error: np.ndarray) -> np.ndarray:

@@ -12,8 +12,7 @@ from pace_actuators.effects import Effect, EffectCfg
 from pace_optim.joints.fits.fits import Fits
 from pace_optim.joints.fits.fitted import Fitted
 from pace_optim.joints.fits.fitting_cfg import DEFAULT, FittingCfg
-from pace_optim.joints.fits.labels import found_effects
-from pace_optim.joints.fits.model import BASE, COLUMN, JointModel, whole_values
+from pace_optim.joints.fits.model import BASE, COLUMN, JointModel, found_effects, whole_values
 from pace_optim.joints.simulation import ReferencePath, measured_path, reference_path, twin_problem
 from pace_optim.joints.simulation.problem import TwinProblem
 from pace_optim.problem.problem import Problem

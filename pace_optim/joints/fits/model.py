@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from pace_actuators.base_parameters import BASE_PARAMETERS
-from pace_actuators.effects import PROBED_STIFFNESS, Effect, EffectParameter
+from pace_actuators.effects import PROBED_STIFFNESS, Effect, EffectCfg, EffectParameter
 from pace_optim.estimate.error_bars.uncertainty import AT_BOUND
 from pace_optim.problem.parameter_space import Box
 from pace_optim.problem.problem import Problem
@@ -349,3 +349,33 @@ def whole_values(model: JointModel, x: torch.Tensor, names: Sequence[str]) -> di
             else:
                 values[key] = {n: float(own[j, k]) for j, n in enumerate(names) if bool(has[j])}
     return values
+
+
+def found_effects(model: JointModel, joint_names: Sequence[str], order: Sequence[type[Effect]] = ()) -> list[EffectCfg]:
+    """The effects that joints have.
+
+    Args:
+        model: The model that has them.
+        joint_names: Its joints.
+        order: Which comes first; none keeps the model's order.
+    """
+    result = []
+    for effect in order or model.effects:
+        has = model.has[model.effects.index(effect)]
+        own = [name for name, yes in zip(joint_names, has.tolist(), strict=True) if yes]
+        if not own:
+            continue
+        everywhere = len(own) == len(joint_names)
+        cfg = EffectCfg(
+            effect=effect.name,
+            joint_names_expr=".*" if effect.shared or everywhere else "|".join(own),
+            shared=effect.shared or effect in model.shared,
+            wide=bool(model.is_wide(effect).any()),
+        )
+        result.append(cfg)
+    return result
+
+
+def labels(model: JointModel, joint_names: Sequence[str], order: Sequence[type[Effect]] = ()) -> list[str]:
+    """The same as ``fit.py --effects`` takes them."""
+    return [cfg.label for cfg in found_effects(model, joint_names, order)]

@@ -10,17 +10,15 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 import torch
-from scipy import fft, optimize
+from scipy import fft, ndimage, optimize
 
 from pace_actuators.effects import EffectCfg, effect_cfgs, get_effect, probe_points
 from pace_envs.tasks.pace import GLOBAL
-from pace_optim.joints.simulation.joint_load import JointLoad, Links, LoadChange, Motion, Parameter
-from pace_optim.joints.simulation.link_states import LinkChange
+from pace_optim.joints.simulation.joint_load import JointLoad, LinkChange, Links, LoadChange, Motion, Parameter
 from pace_optim.problem.free_phases import FreePhases
 from pace_optim.problem.problem import Problem
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import Dataset
-from pace_optim.recording.moving_base import Carried
 from pace_optim.recording.noise import noise_floor
 
 if TYPE_CHECKING:
@@ -70,11 +68,9 @@ def _smooth_phases(error: torch.Tensor, free: torch.Tensor, recording: Recording
     """Smooth errors (T, n) in each free phase by itself; a joint that is held is where it was measured."""
     for j in range(error.shape[1]):
         noise = noise_floor(recording.dof_pos[:, j], dt).sigma
-        own = free[:, j].numpy().astype(int)
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], own, [0]])))
         error[:, j] *= free[:, j]
-        for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-            error[first:end, j] = torch.from_numpy(_smooth(error[first:end, j].numpy(), noise))
+        for (phase,) in ndimage.find_objects(ndimage.label(free[:, j].numpy())[0]):
+            error[phase, j] = torch.from_numpy(_smooth(error[phase, j].numpy(), noise))
 
 
 def _smooth(values: np.ndarray, noise: float) -> np.ndarray:
@@ -242,7 +238,9 @@ def reference_path(
     if problem.joints_stand_alone:
         return _along(problem, values, model_effects, rollout, *motion)
     beside = beside_simulation(problem.dataset, shown - _biases(problem, values))
-    share = 1.0 if problem.dataset.carried is None else _share_of_free(problem.dataset.carried, len(beside))
+    carried, share = problem.dataset.carried, torch.ones(())
+    if carried is not None:  # the part of the time in which each joint is free, (R, n)
+        share = carried.free[: len(beside)].double().mean(dim=0).clamp(min=1e-9)
     beside *= (beside.square().mean(dim=0, keepdim=True) / share).sqrt() <= away
     if late is not None:
         beside[..., late] = 0.0
@@ -301,12 +299,14 @@ def _taken(
 
 def _begun(problem: Problem, values: dict[str, dict[str, float]]) -> Rollout:
     """One candidate at the beginning of all recordings."""
-    rollout, space = problem.evaluator().rollout(1), problem.space
-    own = {
-        p.name: {key: values[p.name][key] for key in p.keys} for p in space.parameters
-    }  # some mean nothing on slides
-    rollout.start(space.from_dict(own)[None], problem.dataset.sampled)
+    rollout = problem.evaluator().rollout(1)
+    rollout.start(_vector(problem, values)[None], problem.dataset.sampled)
     return rollout
+
+
+def _vector(problem: Problem, values: dict[str, dict[str, float]]) -> torch.Tensor:
+    """A candidate, physical (size,), without what means nothing on slides."""
+    return problem.space.from_dict({p.name: {k: values[p.name][k] for k in p.keys} for p in problem.space.parameters})
 
 
 def _along(
@@ -322,9 +322,7 @@ def _along(
     motion = Motion.between(positions, speeds, problem.control_dt, carried, problem.loop_dt)
     phases = None
     if carried is not None:
-        evaluator = problem.evaluator()
-        own = {p.name: {key: values[p.name][key] for key in p.keys} for p in problem.space.parameters}
-        phases = evaluator.free_phases(problem.space.from_dict(own)).of_single_joints()
+        phases = problem.evaluator().free_phases(_vector(problem, values)).of_single_joints()
     now = {
         (name, parameter.name): torch.tensor([*values[f"{name}.{parameter.name}"].values()], dtype=torch.float64)
         for name in model_effects
@@ -351,11 +349,6 @@ def _along(
         control_dt=problem.control_dt,
         phases=phases,
     )
-
-
-def _share_of_free(carried: Carried, steps: int) -> torch.Tensor:
-    """In which part of the time each joint is free, (R, n)."""
-    return carried.free[:steps].double().mean(dim=0).clamp(min=1e-9)
 
 
 def _within_phases(values: torch.Tensor, slope: torch.Tensor, free: torch.Tensor, dt: float) -> torch.Tensor:

@@ -133,9 +133,8 @@ def _block(
         colouring: Which entries belong to which colour and joints.
     """
     size = len(step)
-    row_of = {entry: c for c, entries in enumerate(colouring.colours) for entry in entries}
     entries = [entry for entry in range(size) if set(tree) & set(colouring.joints[entry])]
-    columns = derivatives[[row_of[entry] for entry in entries]][..., tree].flatten(1) / step[entries, None]
+    columns = derivatives[[colouring.row_of[entry] for entry in entries]][..., tree].flatten(1) / step[entries, None]
     first = initial[..., tree].flatten(1)[: len(tree)]  # the i-th set moves this tree's i-th joint
     hessian, effect = columns @ columns.T, columns @ first.T
     at = np.ix_(entries, entries)

@@ -48,7 +48,7 @@ def test_a_recording_of_a_simulation_with_the_assumed_rate_and_this_very_step_sa
 
 def test_a_rate_that_fits_best_is_compared_with_the_others_too():
     """Its values depend on it all the same. Where the fit's own step was the best, none was compared."""
-    problem = recorded_at(0.0005).with_drive_dt(0.0005)
+    problem = recorded_at(0.0005).with_loop(0.0005)
     problem = dataclasses.replace(problem, assumed_loop=problem.loop_dt)
     x, known = fitted(problem)
     rates = loop_rates(problem, x, known.jacobian, ~np.isnan(known.uncertainty.std))
@@ -89,10 +89,10 @@ def test_only_drive_dt_states_a_rate():
     assert not problem.assumes_loop_rate  # a configuration says how its drives run
     of_file = dataclasses.replace(problem, assumed_loop=problem.loop_dt)
     assert of_file.assumes_loop_rate
-    stated = of_file.with_drive_dt(0.001)
-    assert not stated.assumes_loop_rate and stated.loop_dt == 0.001 and stated.physics_dt == 0.0005
-    continuous = of_file.with_drive_dt(0.0)
-    assert not continuous.assumes_loop_rate and continuous.physics_dt == of_file.physics_dt
+    faster = of_file.with_loop(0.001)
+    assert faster.loop_dt == 0.001 and faster.physics_dt == 0.0005
+    continuous = of_file.with_loop(0.0)
+    assert continuous.physics_dt == of_file.physics_dt
     assert all(drive.implicit for drive in continuous.plain_cfg.scene.robot.actuators.values())
 
 

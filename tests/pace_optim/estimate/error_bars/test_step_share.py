@@ -11,7 +11,7 @@ from pace_envs.task_source import EnvironmentRecord
 from pace_optim import fit
 from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.assessment import assess
-from pace_optim.estimate.error_bars.undetermined import change_without_step, step_share
+from pace_optim.estimate.error_bars.physics_step import change_without_step, step_share
 from pace_optim.estimate.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.identification.conclude import conclude
 from pace_optim.identification.optimization import Optimization
