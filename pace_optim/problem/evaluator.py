@@ -163,8 +163,8 @@ class Evaluator:
     def look_around(
         self,
         physical: torch.Tensor,
-        where: torch.Tensor | None = None,
-        own_step: bool = False,
+        *,
+        own_step: bool,
         initial_offset: torch.Tensor | None = None,
     ) -> tuple[Residuals, Residuals]:
         """The residuals of the first candidate (m = 1), and those of all whose differences count.
@@ -173,17 +173,16 @@ class Evaluator:
 
         Args:
             physical: Physical parameters, (m, size).
-            where: As for :meth:`residuals`.
             own_step: Whether they are not.
             initial_offset: As for :meth:`residuals`; none for the first candidate.
         """
         if self._nearby is not None and not own_step:
-            here = self.residuals(physical[:1], where)
+            here = self.residuals(physical[:1])
             self._nearby.phases, self._nearby._phases_at = self.phases, self._phases_at
-            every = self._nearby.residuals(physical, where, initial_offset)
+            every = self._nearby.residuals(physical, initial_offset=initial_offset)
             if bool(every.error[0].isfinite().all()):
                 return here, every
-        every = self.residuals(physical, where, initial_offset)
+        every = self.residuals(physical, initial_offset=initial_offset)
         return every.rows(0, 1), every
 
     def residuals(

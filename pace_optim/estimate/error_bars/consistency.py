@@ -16,6 +16,7 @@ from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty
 from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, least_squares
+from pace_optim.problem.drive_steps import of_joints
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 
@@ -224,9 +225,7 @@ def _nominal_gain(problem: Problem, r: int, field_name: str) -> torch.Tensor:
     if stated is not None:
         return torch.as_tensor(stated, dtype=torch.float64)
     env = problem.make_env(1)
-    result = torch.zeros(len(problem.joint_names), dtype=torch.float64)
-    for actuator in env.scene["robot"].actuators.values():
-        result[actuator.joint_indices] = getattr(actuator, field_name)[0]
+    result = torch.from_numpy(of_joints(env, field_name))
     env.close()
     return result
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -84,11 +83,6 @@ def _free_errors(
     return BlockErrors(square=square, weight=torch.ones(count, dtype=torch.float64))
 
 
-def _usual_time(samples: Sequence[int], control_dt: float) -> float:
-    """How long the median joint is free, of those that ever are [s]."""
-    return float(np.median([count for count in samples if count] or [0])) * control_dt
-
-
 def check_long_enough(
     where: torch.Tensor, control_dt: float, *, free: torch.Tensor | None = None, cfg: FittingCfg = DEFAULT
 ) -> None:
@@ -105,7 +99,7 @@ def check_long_enough(
     """
     if free is not None:
         samples = (free & where[..., None]).sum(dim=(0, 1)).tolist()
-        usual = _usual_time(samples, control_dt)
+        usual = float(np.median([count for count in samples if count] or [0])) * control_dt
         if usual < (least := cfg.blocks * cfg.swing_s):
             raise ValueError(
                 f"In the held-out data, the median joint swings for {usual:.2g} s, too short to judge a model by. "
@@ -120,14 +114,10 @@ def check_long_enough(
         )
 
 
-def _block_length(where: torch.Tensor, control_dt: float, cfg: FittingCfg) -> float:
-    """[s]."""
-    return min(cfg.block_s, max(cfg.shortest_s, sum(_spans(where)) * control_dt / cfg.blocks))
-
-
 def _blocks(where: torch.Tensor, control_dt: float, cfg: FittingCfg) -> list[tuple[int, torch.Tensor]]:
     """Recordings and samples of blocks: of time, so that coarse sampling has the same ones."""
-    steps = max(1, round(_block_length(where, control_dt, cfg) / control_dt))
+    length = min(cfg.block_s, max(cfg.shortest_s, sum(_spans(where)) * control_dt / cfg.blocks))
+    steps = max(1, round(length / control_dt))
     blocks = []
     for r in range(where.shape[1]):
         at = where[:, r].nonzero()[:, 0]

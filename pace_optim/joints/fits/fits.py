@@ -17,8 +17,6 @@ from pace_optim.estimate.levenberg_marquardt import (
     FIRST_DAMPING,
     LinearModel,
     next_damping,
-    rows_of,
-    trial_rows,
 )
 from pace_optim.joints.fits.block_errors import BlockErrors, block_errors
 from pace_optim.joints.fits.fitted import Fitted
@@ -34,8 +32,8 @@ TRIALS = DAMPING_TRIALS[:-1]
 class JointDescent:
     """One model's descent: rows are the favoured step, its neighbours for the next Jacobian, and the other trials.
 
-    In a neighbour every joint has another one of its free entries moved, so that there are as many as a joint has, and
-    not as many as all joints have together.
+    Where the favoured step wins, the next derivatives are already known. In a neighbour every joint has another one of
+    its free entries moved, so that there are as many as a joint has, and not as many as all joints have together.
     """
 
     def __init__(self, start: Fitted, samples: torch.Tensor, keep: bool, rough: bool, cfg: FittingCfg):
@@ -86,13 +84,13 @@ class JointDescent:
         neighbours = favoured.repeat(self._gradient.shape[1], 1, 1)
         for j, at in enumerate(self._free):
             neighbours[torch.arange(len(at)), j, at] += self._step[j, at]
-        return rows_of(trials, neighbours)
+        return torch.cat([trials[:1], neighbours, trials[1:]])
 
     def tell(self, x: torch.Tensor, error: torch.Tensor) -> None:
         """Take the best row of each joint."""
         size = self.x.shape[1]
         scores = error.square().sum(dim=(1, 2), dtype=torch.float64).cpu() / self._samples
-        choice = trial_rows(len(x), len(TRIALS))
+        choice = [0, *range(len(x) - len(TRIALS) + 1, len(x))]  # the trials, the favoured first
         best = scores[choice].argmin(dim=0)
         lowest = scores[choice].gather(0, best[None])[0]
         better = lowest < self.score

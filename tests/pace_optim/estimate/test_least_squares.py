@@ -94,11 +94,11 @@ class Curved:
     def look_at_phases(self, physical, anew=False):
         return False
 
-    def look_around(self, x, where=None, own_step=False):
-        every = self.residuals(x, where)
+    def look_around(self, x, own_step=False):
+        every = self.residuals(x)
         return every.rows(0, 1), every
 
-    def residuals(self, physical, where=None):
+    def residuals(self, physical):
         x = physical[:, 0]
         error = torch.stack([x - 0.3, 1 + 0.5 * self.bend * x.square()], dim=1)[..., None, None]
         return Residuals(error=error, where=torch.ones(2, 1, dtype=torch.bool), step=torch.arange(2))
@@ -223,13 +223,12 @@ class Fake:
     def look_at_phases(self, physical, anew=False):
         return False
 
-    def look_around(self, x, where=None, own_step=False):
-        every = self.residuals(x, where)
+    def look_around(self, x, own_step=False):
+        every = self.residuals(x)
         return every.rows(0, 1), every
 
-    def residuals(self, x, where=None):
+    def residuals(self, x):
         self.batches.append(x)
-        assert where is None
         error = torch.stack([self.function(row) for row in x])[:, :, None, None]
         where = torch.ones(error.shape[1], 1, dtype=torch.bool)
         return Residuals(error=error, where=where, step=torch.arange(error.shape[1]))
@@ -357,11 +356,11 @@ class Rattling:
     def look_at_phases(self, physical, anew=False):
         return False
 
-    def look_around(self, x, where=None, own_step=False):
-        every = self.residuals(x, where)
+    def look_around(self, x, own_step=False):
+        every = self.residuals(x)
         return every.rows(0, 1), every
 
-    def residuals(self, x, where=None):
+    def residuals(self, x):
         self.rows += len(x)
         error = (x - TARGET) @ self.slope.T + self.noise + self.rattle * torch.sin(x @ self.wave.T + self.phase)
         where = torch.ones(SAMPLES, 1, dtype=torch.bool)
@@ -393,8 +392,8 @@ class Misled(Rattling):
 
     looks_coarser = True
 
-    def look_around(self, x, where=None, own_step=False):
-        every = self.residuals(x, where)
+    def look_around(self, x, own_step=False):
+        every = self.residuals(x)
         wild = torch.randn(every.error.shape, generator=torch.Generator().manual_seed(self.rows))
         return every.rows(0, 1), every if own_step else dataclasses.replace(every, error=wild.double())
 
