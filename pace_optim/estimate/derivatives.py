@@ -137,7 +137,6 @@ def stencil(
     """Where to look around x.
 
     Args:
-        x: Normalised vector, (size,).
         hessian: JᵀJ as it is known, (size, size), of which the principal directions are; ``None``: each entry alone.
         noise: The simulation's own noise, as :meth:`Stencil.noise` has it [rad].
         score: The score at x [rad²].

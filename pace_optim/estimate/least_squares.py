@@ -190,9 +190,7 @@ def least_squares(
     """Refine starts, one after the other, to the nearest minimum of the score.
 
     Args:
-        colouring: Which entries are perturbed together.
         starts: Normalised vectors, (size,), or descents to go on with.
-        cfg: When a descent ends.
         on_iteration: Called with all descents after each iteration; it may raise KeyboardInterrupt to stop.
 
     Returns:
@@ -291,7 +289,6 @@ def by_chords(
     """Steps with known derivatives, as long as they gain what these promise.
 
     Args:
-        x: Normalised, (size,).
         there: Residuals at x, and derivatives near it.
         tolerance: The part of the score that a step gains at least.
 

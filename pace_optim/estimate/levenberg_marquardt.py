@@ -60,7 +60,6 @@ def bounded_step(x: torch.Tensor, hessian: torch.Tensor, gradient: torch.Tensor,
     Entries without influence stay.
 
     Args:
-        x: Present vector, (size,).
         hessian: JᵀJ, (size, size).
         gradient: Jᵀr, (size,).
 

@@ -109,10 +109,6 @@ class Objective:
     def errors(self, evaluator: Evaluator, physical: torch.Tensor, where: torch.Tensor) -> torch.Tensor:
         """The score of candidates, in parts in time; the sum over the parts is the score.
 
-        Args:
-            physical: Physical parameters, (m, size).
-            where: Which samples count, (T, R) bool.
-
         Returns:
             (m, parts).
         """
@@ -222,7 +218,6 @@ def objective_error_bars(
 
     Args:
         evaluator: Simulates what is trained on.
-        x: The minimum, normalised (size,).
     """
     space, where = evaluator.space, evaluator.dataset.train
 

@@ -58,7 +58,6 @@ def fit(
 
     Args:
         settings: What to fit, and how; its task and effects are known (:func:`pace_envs.task_source.use_task`).
-        progress: Shows how far it is.
         before: The run whose robot is fitted anew, if there is one.
         on_start: Gets the run's folder before the first simulation.
         assess_interrupted: Whether an interrupted fit still assesses and writes the best so far; otherwise the
@@ -176,7 +175,6 @@ def resume(
 
     Args:
         max_iteration: Another largest number of generations.
-        progress: Shows how far it is.
         task: Where the run's environment is found now, if it has been moved.
         device: Where the search simulates; ``None``: as before.
         processes: As for :func:`fit`.

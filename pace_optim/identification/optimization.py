@@ -92,7 +92,6 @@ class Optimization:
         """Prepare evaluators and optimizers; nothing is simulated yet.
 
         Args:
-            progress: Shows how far it is.
             processes: Who shares the search's candidates.
         """
         self.settings = settings
@@ -320,7 +319,6 @@ class Optimization:
         """Go on from the end of a fit at half its physics step, where that shows.
 
         Args:
-            x: That end, normalised (size,).
             there: Its residuals (m = 1).
             change: How they would change without a step, (K, R, n) [rad]; ``None``: that is not known.
 

@@ -172,7 +172,6 @@ class Evaluator:
         The latter are simulated at a longer physics step where there is one, and the first candidate does not diverge.
 
         Args:
-            physical: Physical parameters, (m, size).
             own_step: Whether they are not.
             initial_offset: As for :meth:`residuals`; none for the first candidate.
         """
@@ -194,7 +193,6 @@ class Evaluator:
         """Simulate candidates and keep their errors.
 
         Args:
-            physical: Physical parameters, (m, size).
             where: Which samples count, (T, R) bool; ``None`` means those to train on.
             initial_offset: Added to each recording's first position, (m, n) [rad].
         """
@@ -212,7 +210,6 @@ class Evaluator:
         Nothing where no base moves. The first candidate that is simulated is one.
 
         Args:
-            physical: Its parameters, (size,).
             anew: Whether to do it although that is known of another candidate.
 
         Returns:

@@ -134,7 +134,6 @@ class FreePhases:
         Args:
             error: (m, K, R, n) [rad].
             step: Control step of each of the K, ascending, (K,).
-            where: Which samples count, (T, R) bool.
         """
         for block, (begin, end, factor) in zip(self.blocks, self._where(step, where), strict=True):
             if begin < end:
@@ -150,7 +149,6 @@ class FreePhases:
 
         Args:
             step: Control step of each of the K, ascending, (K,).
-            where: Which samples count, (T, R) bool.
         """
         if self.expected is None:
             return
@@ -332,7 +330,6 @@ def free_phases(
     Args:
         change: What :class:`PhaseProbes` change of what encoders show at all control steps, (2 depth + 6, T, R, n).
         error: Of the candidate without those changes, (T, R, n) [rad].
-        control_dt: [s].
     """
     turning = carried.base[..., :3].diff(dim=0) / control_dt
     influence = _Influence(

@@ -51,7 +51,6 @@ class Assessment:
 
         Args:
             problem: What was fitted, or the same with other facts.
-            x: The vector, normalised (size,).
             held: Labels of what is held where it is.
         """
         residuals = training.residuals(problem.space.to_physical(x)[None])
@@ -73,7 +72,6 @@ def assess(
     descent ended early, and x goes on to the minimum here.
 
     Args:
-        x: Normalised, (size,).
         ended: What ended there or near it, which knows the principal directions; ``None``: they are looked for.
         training: Simulates what is trained on; ``None``: the problem's own.
     """
@@ -171,9 +169,6 @@ def _late_forces(jacobian: Jacobian, evaluator: Evaluator, space: ParameterSpace
         d - kp τ        a - (kd + d) τ        delay + τ
 
     of which no log shows τ. A simulator whose step h is semi-implicit logs positions that are h / 2 ahead.
-
-    Args:
-        x: Normalised, (size,).
     """
     rollout, physical, slope = evaluator.rollout(1), space.to_physical(x), space.slope(x)
     change, viscous = torch.zeros_like(jacobian.residuals.error[0]), space["viscous_friction"]
@@ -228,7 +223,6 @@ def make_probes(
     """What to simulate for the error bars at x.
 
     Args:
-        x: Normalised vector, (size,).
         around: Vectors around x that give the derivatives.
         trees: Groups of joints that do not influence each other.
         shake: How far first positions are moved [rad].

@@ -63,7 +63,6 @@ def check_consistency(
     """Fit each training recording alone, from the joint result, and compare beyond the error bars.
 
     Args:
-        x: Its result, normalised (size,).
         score: Its score [rad²].
         there: Residuals and derivatives at x on the training samples; ``None``: they are simulated.
     """

@@ -100,11 +100,7 @@ class LoopRates:
         return np.sqrt(self.weights)[:, None] * (self.values - self.value_at(self.chosen))
 
     def at(self, space: ParameterSpace, physical: np.ndarray) -> LoopRates:
-        """The same about a result: the chosen period's values are the result's, and the others' as far away as here.
-
-        Args:
-            physical: The result, (size,).
-        """
+        """The same about a result: the chosen period's values are the result's, and the others' as far away as here."""
         moved = self.values + (physical - self.value_at(self.chosen))
         return replace(self, values=np.clip(moved, space.lower.numpy(), space.upper.numpy()))
 
@@ -171,7 +167,6 @@ def loop_rates(
 
     Args:
         problem: What was fitted, with loops of an assumed rate.
-        x: The result, normalised (size,).
         there: Its residuals, and derivatives there, on the training samples.
         known: Which parameters have an error bar, (size,) bool; the others stay.
         phases: What the residuals have taken out of free phases.
@@ -270,7 +265,6 @@ def _against(errors: torch.Tensor, weights: np.ndarray, where: torch.Tensor, noi
     Args:
         errors: Residuals at the simulated periods, (m, K, R, n).
         weights: Of these in each candidate's, (candidates, m).
-        where: Which samples there are, (K, R) bool.
         noise: Sum of squares that the noise alone leaves [rad²].
     """
     series = [

@@ -25,10 +25,6 @@ def step_error(problem: Problem, physical: torch.Tensor, where: torch.Tensor) ->
     """RMS change of each joint when the physics step is halved, (n,) [rad], in windows of the recordings.
 
     Zero where it cannot be simulated, or nothing counts.
-
-    Args:
-        physical: One candidate, (size,).
-        where: Which samples count, (T, R) bool.
     """
     if not bool(where.any()):
         return torch.zeros(len(problem.joint_names), dtype=torch.float64)
@@ -48,7 +44,6 @@ def change_without_step(
     """How the motion would change if the physics had no step, on the training samples, (K, R, n) [rad].
 
     Args:
-        physical: The result, (size,).
         phases: What these have taken out of free phases.
 
     Returns:
@@ -74,7 +69,6 @@ def step_share(
     Args:
         there: At the result, on the training samples.
         change: Of the residuals when the step goes, (K, R, n) [rad].
-        x: The result, normalised (size,).
         known: Which parameters have an error bar, (size,) bool; the others stay.
     """
     result = np.where(known, 0.0, np.nan)

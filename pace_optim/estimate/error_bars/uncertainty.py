@@ -94,7 +94,6 @@ def estimate_uncertainty(
     Of a walking robot's swings, Σ is known (:mod:`pace_optim.estimate.error_bars.assessment`).
 
     Args:
-        x: The optimum, normalised (size,).
         initial: Derivatives of the residuals by the first positions of ``initial_joints``, (sets, K, R, n).
         initial_joints: Joints whose first position was moved together.
         held: Labels of what is held where it is; it has no error bar, and the others have those beside it.
@@ -124,7 +123,6 @@ def uncertainty_of(
     Args:
         hessian: H = JᵀJ, normalised (size, size) [rad²].
         middle: JᵀΣJ, normalised (size, size) [rad⁴].
-        x: The optimum, normalised (size,).
         held: Labels of what is held where it is.
     """
     size = space.size

@@ -74,7 +74,6 @@ def undetermined(problem: Problem, x: torch.Tensor, uncertainty: Uncertainty, fa
     An encoder bias is open if others compensate for it exactly, such as the phase of a ripple on an unloaded joint.
 
     Args:
-        x: The result, normalised (size,).
         far: Whether the fit ended so far above the noise that error bars mean nothing: then they leave nothing open.
     """
     silent = set(uncertainty.no_influence)
@@ -122,7 +121,6 @@ def held_at_prior(
     are, and where that costs too much, only what has no influence.
 
     Args:
-        x: The result, normalised (size,).
         cfg: How the rest is fitted; ``None`` holds only what has no influence.
     """
     silent = [label for label in labels if label in uncertainty.no_influence]
@@ -153,7 +151,6 @@ def without_delay(
     the delay is inertia, kp times it viscous friction.
 
     Args:
-        x: The result, normalised (size,).
         held: Labels of what is held at its prior already.
     """
     space = problem.space
@@ -179,11 +176,7 @@ def _fitted_beside(problem: Problem, x: torch.Tensor, labels: list[str], cfg: Le
 
 
 def at_prior(problem: Problem, x: torch.Tensor, labels: list[str]) -> torch.Tensor:
-    """A normalised vector (size,) with some entries at their prior.
-
-    Args:
-        x: Normalised, (size,).
-    """
+    """A normalised vector (size,) with some entries at their prior."""
     space = problem.space
     at = [space.labels.index(label) for label in labels]
     result = x.clone()

@@ -50,7 +50,6 @@ def fit_warnings(
     """Plain sentences, one for each kind; none if all is well.
 
     Args:
-        physical: The result, (size,).
         rmse: Errors as in ``result.json``.
         left_open: Labels of parameters that the recordings do not determine, at their prior.
         unsure: Labels of those that are not determined either, but fit worse there.

@@ -48,10 +48,7 @@ def block_errors(
 
     Args:
         error: (T, R, n) at every control step.
-        where: Which samples count, (T, R) bool.
-        control_dt: [s].
         weight: What errors were multiplied by, (T, R, n), 0 where a joint is held; ``None``: 1.
-        cfg: How long blocks are.
     """
     if weight is not None:
         return _free_errors(error, where, weight, control_dt, cfg)
@@ -89,10 +86,7 @@ def check_long_enough(
     """See that recordings are long enough to judge by.
 
     Args:
-        where: Which samples count, (T, R) bool.
-        control_dt: [s].
         free: Where joints are free, (T, R, n) bool; ``None``: everywhere.
-        cfg: How long they are.
 
     Raises:
         ValueError: If they are not.

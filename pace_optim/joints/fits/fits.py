@@ -40,11 +40,9 @@ class JointDescent:
         """Begin at the model's x.
 
         Args:
-            start: The model.
             samples: How many count for each joint, (n,).
             keep: Whether the last Jacobian is kept.
             rough: Whether derivatives are taken over wide steps first.
-            cfg: Steps and tolerances.
         """
         self._cfg = cfg
         self.model, self.tried, self._samples, self._keep = start.model, start.tried, samples, keep
@@ -220,7 +218,6 @@ class Fits:
         Models that the control step shows to be far behind the best one on every joint stay where it left them.
 
         Args:
-            problem: The joints simulated alone.
             starts: Models and where they start.
             rough: Whether to go on over wide steps where narrow ones have led.
         """
@@ -240,8 +237,6 @@ class Fits:
         """A model fitted in windows over wide steps, where narrow ones may lead no further.
 
         Args:
-            problem: The joints simulated alone.
-            now: The model.
             kept: Which windows that are trained on count for which joints, (R, n) bool; all if not given.
         """
         return self.side_by_side(problem.in_windows(), [now], self.cfg.coarse, rough=True, kept=kept)[0]
@@ -295,7 +290,6 @@ class Fits:
         with more damping. Joints do not influence each other, so that one row serves all of them.
 
         Args:
-            problem: The joints simulated alone.
             starts: Models and where they start.
             max_iteration: Largest number of iterations.
             keep_jacobian: Whether the last Jacobian is kept.
@@ -339,8 +333,6 @@ class Fits:
         """Fit models of all joints on some of them, and their errors; the others stay as they are, and cost nothing.
 
         Args:
-            problem: All joints.
-            starts: The models.
             joints: Which are fitted, (n,) bool.
             errors: What the other joints' errors are.
         """
@@ -358,8 +350,6 @@ class Fits:
         Rousseeuw 1984, least median of squares regression).
 
         Args:
-            problem: The joints simulated alone.
-            now: The model.
             joints: Which of them are fitted so, (n,) bool; for the others all windows count.
         """
         cfg = self.cfg

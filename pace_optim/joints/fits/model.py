@@ -178,8 +178,6 @@ class JointModel:
         """The same with an effect on some more joints, and the physical values (n, P) with those of the effect.
 
         Args:
-            physical: Of this model, (n, P).
-            effect: The effect.
             joints: Which joints get it, (n,) bool.
             values: Of the effect, (n, parameters).
         """
@@ -230,12 +228,7 @@ class JointModel:
         return has & ((self.lower[:, columns] < least) | (self.upper[:, columns] > most)).any(dim=1)
 
     def structure_held(self, effect: type[Effect], physical: torch.Tensor) -> JointModel:
-        """Fix the discrete parameter of an effect: it cannot be optimized by gradients.
-
-        Args:
-            effect: The effect.
-            physical: Of this model, (n, P).
-        """
+        """Fix the discrete parameter of an effect: it cannot be optimized by gradients."""
         if not effect.structural:
             return self
         return self.held(effect, [effect.structural], physical)
@@ -244,9 +237,7 @@ class JointModel:
         """The same with parameters of an effect held where they are, on the joints that have it.
 
         Args:
-            effect: The effect.
             names: Its parameters.
-            physical: Of this model, (n, P).
         """
         has, start = self.has[self.effects.index(effect)], self.columns(effect).start
         lower, upper = self.lower.clone(), self.upper.clone()
@@ -356,7 +347,6 @@ def found_effects(model: JointModel, joint_names: Sequence[str], order: Sequence
 
     Args:
         model: The model that has them.
-        joint_names: Its joints.
         order: Which comes first; none keeps the model's order.
     """
     result = []

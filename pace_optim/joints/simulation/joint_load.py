@@ -94,8 +94,6 @@ class Motion:
         """The motion between control steps, of positions (T, R, nq) and speeds (T, R, nv) at them.
 
         Args:
-            qpos: Positions.
-            qvel: Speeds.
             dt: Control step [s].
             carried: How the base moves; ``None``: it rests.
             loop_dt: Time for which drives hold their torques [s].
@@ -161,9 +159,6 @@ class LinkStates:
 
         Args:
             model: Without constraints; the drives neither weigh nor rub.
-            qpos: Positions.
-            qvel: Speeds.
-            qacc: Accelerations.
             follow: Gives how all speeds follow from the drives' at a posture (nq,).
             frame: How the model's frame moves, (B, 9); ``None``: it rests.
             point: Where its specific force acts, (3,) [m].

@@ -53,8 +53,6 @@ class KernelRollout:
         Args:
             rollout: Of joints that are simulated alone, on the processor.
             parts: All its environments; in those of a part the same effects act.
-            compiler: Compiles kernels.
-            device: Where they run.
         """
         self._rollout, self._parts, self._compiler, self._device = rollout, list(parts), compiler, device
         self._groups: list[_Group] = []
@@ -205,7 +203,6 @@ def _recorded(rollout: Rollout, actuator: PaceDCMotor, rows: range) -> Program:
     Args:
         rollout: Of joints that are simulated alone; it has begun with a control step.
         actuator: One of its robot's drives.
-        rows: Environments.
 
     Raises:
         NotTraceableError: If a kernel cannot do it, such as an effect that branches over a tensor's values.

@@ -45,7 +45,6 @@ def beside_simulation(dataset: Dataset, shown: torch.Tensor) -> torch.Tensor:
     """How far the robot was from its simulation at control steps, without the measurement's noise, (count, R, n) [rad].
 
     Args:
-        dataset: The recordings.
         shown: What encoders show in the simulation where there are samples, (count, R, n) [rad].
     """
     count = len(shown)
@@ -217,8 +216,6 @@ def reference_path(
     it is what they did, not what the candidate lets them do.
 
     Args:
-        problem: The problem; its own effects count too.
-        physical: The candidate's physical parameters, (size,).
         model_effects: Effects on the rigid-body model whose influence is wanted.
         late: Joints that are not taken there, (n,) bool: it may be their log that is late. ``None``: no joint.
         away: Nor are those that are further from it than this, RMS over a recording [rad]: gravity is not linear in

@@ -65,7 +65,6 @@ def twin_problem(problem: Problem, path: ReferencePath) -> TwinProblem:
     """The same recordings and parameters, each joint a separate tree.
 
     Args:
-        problem: The problem of the whole robot.
         path: A reference simulation on the same recordings.
     """
     content = {field.name: getattr(problem, field.name) for field in fields(Problem)}

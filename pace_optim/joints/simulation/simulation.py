@@ -33,10 +33,7 @@ class TwinSimulation(Simulation):
         """Set up the state.
 
         Args:
-            cfg: The configuration; the time step counts.
-            spec: The robot's model.
             num_envs: Number of environments, a multiple of the path's recordings.
-            path: The reference.
         """
         self.path = path
         super().__init__(cfg, spec, num_envs)

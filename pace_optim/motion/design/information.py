@@ -130,7 +130,6 @@ def _block(
         derivatives: Change of the positions by each colour's step, (colours, T, n) [rad].
         initial: Derivatives by the first positions, (sets, T, n).
         step: Signed step of every entry, (size,).
-        colouring: Which entries belong to which colour and joints.
     """
     size = len(step)
     entries = [entry for entry in range(size) if set(tree) & set(colouring.joints[entry])]
