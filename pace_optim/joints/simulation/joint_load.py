@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from types import MappingProxyType
 
@@ -36,11 +36,13 @@ class JointLoad:
     load: torch.Tensor
     """The same without what the other joints' accelerations do: the load that a robot's drives get [N m]."""
 
+    stiffness: torch.Tensor
+    """Derivative of the torque by the joint's own position [N m/rad]."""
+
     @classmethod
     def empty(cls, shape: Sequence[int]) -> JointLoad:
         """Room for (T, R, n)."""
-        inertia, torque, load = (torch.empty(*shape, dtype=torch.float64) for _ in range(3))
-        return cls(inertia=inertia, torque=torque, load=load)
+        return cls(**{each.name: torch.empty(*shape, dtype=torch.float64) for each in fields(cls)})
 
     def put(self, at: tuple[slice, int], felt: Sequence[np.ndarray]) -> None:
         """Write inertia, torque and load of a part."""
@@ -49,27 +51,11 @@ class JointLoad:
 
     def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> JointLoad:
         """The same change of each."""
-        return JointLoad(inertia=change(self.inertia), torque=change(self.torque), load=change(self.load))
+        return JointLoad(**{name: change(own) for name, own in vars(self).items()})
 
     def less(self, other: JointLoad, times: torch.Tensor) -> JointLoad:
         """This less a multiple of another."""
-        return JointLoad(
-            inertia=self.inertia - times * other.inertia,
-            torque=self.torque - times * other.torque,
-            load=self.load - times * other.load,
-        )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class LoadChange(JointLoad):
-    """What a unit of an effect's parameter changes of what is felt."""
-
-    stiffness: torch.Tensor
-    """Of the derivative of the torque by the joint's own position, (T, R, n) [N m/rad]."""
-
-    def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> LoadChange:
-        """The same change of each."""
-        return replace(self, **vars(super().map(change)), stiffness=change(self.stiffness))
+        return JointLoad(**{name: own - times * getattr(other, name) for name, own in vars(self).items()})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -302,6 +288,8 @@ class Links:
         self, motion: Motion, changes: Mapping[Parameter, LinkChange] = MappingProxyType({})
     ) -> tuple[JointLoad, dict[Parameter, JointLoad]]:
         """Inertia of each joint, and the torque that the rest of the robot leaves on it; and how changes change these.
+
+        The stiffness is left open.
 
         With the speeds of all degrees of freedom v = T v_d of those of the driven joints, bias b and passive torques s
         (springs, viscous and Coulomb friction of joints without drives):

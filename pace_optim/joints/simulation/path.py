@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,7 @@ from scipy import fft, ndimage, optimize
 
 from pace_actuators.effects import EffectCfg, effect_cfgs, get_effect, probe_points
 from pace_envs.tasks.pace import GLOBAL
-from pace_optim.joints.simulation.joint_load import JointLoad, LinkChange, Links, LoadChange, Motion, Parameter
+from pace_optim.joints.simulation.joint_load import JointLoad, LinkChange, Links, Motion, Parameter
 from pace_optim.problem.free_phases import FreePhases
 from pace_optim.problem.problem import Problem
 from pace_optim.recording import Recording
@@ -111,9 +111,7 @@ class ReferencePath:
     position: torch.Tensor
     """(T, R, n) [rad]."""
     feel: JointLoad
-    stiffness: torch.Tensor
-    """Derivative of the torque by the joint's own position, (T, R, n) [N m/rad]."""
-    model_effects: dict[tuple[str, str], LoadChange]
+    model_effects: dict[Parameter, JointLoad]
     """Change of what is felt per unit of an effect's parameter, by (effect, parameter)."""
     columns: torch.Tensor
     """The joints' degrees of freedom in the model, (n,)."""
@@ -188,7 +186,6 @@ class ReferencePath:
             rest_inertia=self.rest_inertia[recording],
             position=of(self.position, step),
             feel=self.feel.map(lambda each: of(each, intervals)),
-            stiffness=of(self.stiffness, intervals),
             model_effects={key: feel.map(lambda each: of(each, intervals)) for key, feel in self.model_effects.items()},
         )
 
@@ -197,7 +194,6 @@ class ReferencePath:
             self,
             position=self.position[index],
             feel=self.feel.map(lambda each: each[index]),
-            stiffness=self.stiffness[index],
             model_effects={key: feel.map(lambda each: each[index]) for key, feel in self.model_effects.items()},
             **changes,
         )
@@ -223,15 +219,7 @@ def reference_path(
     """
     problem, values = _on_all_joints(problem, physical, model_effects)
     rollout = _begun(problem, values)
-    moved: list[torch.Tensor] = []
-
-    def noted(steps: int) -> Iterable[torch.Tensor]:
-        shown, *moved[:] = rollout.motion(steps)
-        return shown
-
-    shown = torch.stack([each.clone() for _, each in rollout.samples(simulated=noted)])
-    positions, speeds = (each[: len(shown)].clone() for each in moved)
-    motion = positions, speeds
+    shown, *motion = rollout.motion(rollout.duration_steps)
     if problem.joints_stand_alone:
         return _along(problem, values, model_effects, rollout, *motion)
     beside = beside_simulation(problem.dataset, shown - _biases(problem, values))
@@ -327,19 +315,16 @@ def _along(
     }
     links, changes = Links.of(rollout.env), {key: _link_change(rollout, *key, own) for key, own in now.items()}
     feel, felt = links.feel(motion, changes)
-    stiffness, stiffer = _stiffness(problem, links, motion, feel, felt, changes)
-    load_changes = {}
+    _add_stiffness(problem, links, motion, feel, felt, changes)
     for key, has in now.items():  # each twin has its own part of an effect itself; its neighbours' stays
-        change = load_changes[key] = LoadChange(**vars(felt[key]), stiffness=stiffer[key])
-        feel, stiffness = feel.less(change, has), stiffness - has * change.stiffness
+        feel = feel.less(felt[key], has)
     columns, sim = rollout.robot.dof_columns, rollout.env.sim
     rest_inertia = 1 / sim.friction_weights(columns) - sim.expand("dof_armature")[:, columns]
     rollout.env.close()
     return ReferencePath(
         position=positions[..., rollout.robot.qpos_columns],
         feel=feel,
-        stiffness=stiffness,
-        model_effects=load_changes,
+        model_effects=felt,
         columns=columns,
         rest_inertia=rest_inertia,
         names=tuple(rollout.robot.joint_names),
@@ -375,26 +360,23 @@ def _on_all_joints(
     return problem.with_effects([*others, *(EffectCfg(effect=effect) for effect in effects)]), values
 
 
-def _stiffness(
+def _add_stiffness(
     problem: Problem,
     links: Links,
     motion: Motion,
     feel: JointLoad,
     felt: Mapping[Parameter, JointLoad],
     changes: Mapping[Parameter, LinkChange],
-) -> tuple[torch.Tensor, dict[Parameter, torch.Tensor]]:
-    """Derivative of f_j - M_j a_j by each joint's own position, and how changes change it, (T, R, n) each."""
+) -> None:
+    """Write the derivative of f_j - M_j a_j by each joint's own position, and how changes change it."""
     steps, motion = len(motion.qpos), motion.every(_STIFFNESS_EVERY)
-    stiffness = torch.empty_like(feel.torque)
-    stiffer = {key: torch.empty_like(stiffness) for key in changes}
     for moved in _one_of_each_tree(problem):
         there, others = links.feel(motion.moved(links.shifts(motion, moved, _STEP)), changes)
-        every = [(stiffness, feel, there), *((stiffer[key], felt[key], others[key]) for key in changes)]
-        for result, here, each in every:
+        for here, each in ((feel, there), *((felt[key], others[key]) for key in changes)):
             before = here.map(lambda own: own[::_STIFFNESS_EVERY])
             change = each.torque - before.torque - (each.inertia - before.inertia) * motion.qacc[..., links.columns]
-            result[..., moved] = (change[..., moved] / _STEP).repeat_interleave(_STIFFNESS_EVERY, dim=0)[:steps]
-    return stiffness, stiffer
+            change = (change[..., moved] / _STEP).repeat_interleave(_STIFFNESS_EVERY, dim=0)
+            here.stiffness[..., moved] = change[:steps]
 
 
 def _one_of_each_tree(problem: Problem) -> Iterator[list[int]]:

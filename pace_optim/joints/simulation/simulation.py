@@ -63,10 +63,8 @@ class TwinSimulation(Simulation):
             name: ``inertia``, ``torque`` or ``stiffness``; of a physics step of the interval, such as ``middle.1``,
                 ``middle``, ``begin`` or ``load``; of a model effect, ``<effect>.<parameter>.inertia`` and so on.
         """
-        if name in ("inertia", "torque"):
+        if name in ("inertia", "torque", "stiffness"):
             return getattr(self.path.feel, name)
-        if name == "stiffness":
-            return self.path.stiffness[: self._intervals]
         kind, _, rest = name.partition(".")
         if rest.isdigit():
             last = self._steps_per_interval - 1
