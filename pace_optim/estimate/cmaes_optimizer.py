@@ -57,9 +57,9 @@ class CMAESOptimizerCfg(Config):
 class TreeSearch:
     """The strategies of all trees: vectors are drawn, and learnt from their scores; no simulator is known here.
 
-    With several trees each has its own strategy on the same rollouts. Shared parameters (the delay) are searched by
-    each tree on its own until the trees know theirs well; then the one value with the lowest total score is taken for
-    all, and the search goes on with it.
+    With several trees (groups of joints that do not influence each other) each has its own strategy on the same
+    rollouts. Shared parameters (the delay) are searched by each tree on its own until the trees know theirs well; then
+    the one value with the lowest total score is taken for all, and the search goes on with it.
     """
 
     def __init__(
@@ -287,10 +287,6 @@ class CMAESOptimizer(TreeSearch):
                 error_pos = torch.sum((sim_dof_pos - self.sim_params[:, self.bias_idx] - real_dof_pos) ** 2, dim=1)
                 error_vel = torch.sum((self.sim_dof_vel - self.real_dof_vel) ** 2, dim=1)
                 self.scores += 0.7 * error_pos + 0.3 * error_vel
-
-    With several trees (groups of joints that do not influence each other), each has its own strategy on the same
-    rollouts. Shared parameters (the delay) are searched by each tree on its own until the trees know theirs well;
-    then the one value with the lowest total score is taken for all, and the search goes on with it.
 
     Attributes:
         armature_idx, damping_idx, friction_idx, bias_idx, delay_idx: Slices of the parameter vector.
