@@ -46,10 +46,10 @@ class TwinSimulation(Simulation):
         self._intervals = len(path.feel.torque)
         self._steps_per_interval = round(path.control_dt / cfg.dt)
         self._inertia, self._torque, self._stiffness = (
-            _OneByOne(self.series(name)) for name in ("inertia", "torque", "stiffness")
+            self.series(name) for name in ("inertia", "torque", "stiffness")
         )
         self._middle, self._begin, self._load = (
-            [_OneByOne(self._in_part(name, part)) for part in range(self._steps_per_interval)]
+            [self._in_part(name, part) for part in range(self._steps_per_interval)]
             for name in ("middle", "begin", "load")
         )
         self._model_values: dict[tuple[str, str], torch.Tensor] = {}
@@ -268,23 +268,6 @@ class TwinSimulation(Simulation):
             field.copy_(value.view(field.shape))
         else:
             field[:, self._columns] = value.view(len(field), -1)
-
-
-class _OneByOne:
-    """One tensor an interval: taking them out of a list costs nothing at each step, making it pays after the first."""
-
-    def __init__(self, values: torch.Tensor):
-        """Of (T, …)."""
-        self._values = values
-        self._list: tuple[torch.Tensor, ...] = ()
-
-    def __getitem__(self, interval: int) -> torch.Tensor:
-        """Of an interval."""
-        if not self._list:
-            if interval == 0:
-                return self._values[0]
-            self._list = self._values.unbind()
-        return self._list[interval]
 
 
 def _between(at_instants: torch.Tensor, part: float) -> torch.Tensor:
