@@ -539,8 +539,9 @@ class Reading:
 
     def to(self, device: torch.device) -> Reading:
         """The same on a device."""
-        own = {name: each.to(device) for name, each in vars(self).items() if isinstance(each, torch.Tensor)}
-        return replace(self, **own)
+        offset = None if self.offset is None else self.offset.to(device)
+        late, first, rate = (each.to(device) for each in (self.late, self.first, self.rate))
+        return replace(self, late=late, first=first, rate=rate, offset=offset)
 
 
 def _changes(enable: torch.Tensor | None) -> frozenset[int]:

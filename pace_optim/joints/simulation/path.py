@@ -219,9 +219,9 @@ def reference_path(
     """
     problem, values = _on_all_joints(problem, physical, model_effects)
     rollout = _begun(problem, values)
-    shown, *motion = rollout.motion(rollout.duration_steps)
+    shown, positions, speeds = rollout.motion(rollout.duration_steps)
     if problem.joints_stand_alone:
-        return _along(problem, values, model_effects, rollout, *motion)
+        return _along(problem, values, model_effects, rollout, positions, speeds)
     beside = beside_simulation(problem.dataset, shown - _biases(problem, values))
     carried, share = problem.dataset.carried, torch.ones(())
     if carried is not None:  # the part of the time in which each joint is free, (R, n)
@@ -229,7 +229,8 @@ def reference_path(
     beside *= (beside.square().mean(dim=0, keepdim=True) / share).sqrt() <= away
     if late is not None:
         beside[..., late] = 0.0
-    return _along(problem, values, model_effects, rollout, *_taken(rollout, *motion, beside, problem.control_dt))
+    moved = _taken(rollout, positions, speeds, beside, problem.control_dt)
+    return _along(problem, values, model_effects, rollout, *moved)
 
 
 def measured_path(problem: Problem, physical: torch.Tensor, model_effects: Sequence[str] = ()) -> ReferencePath:
