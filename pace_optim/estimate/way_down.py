@@ -92,7 +92,8 @@ class WayDown:
         """Score that missing physics leaves by itself [rad²]; 0: unknown."""
         self.descents: list[Descent] = []
         """All so far, in the order in which they began."""
-        self.stages = f"{name}{PIECES}", f"{name}{WHOLE}"
+        begins = f"{name}, " if name else ""
+        self.stages = f"{begins}{PIECES}", f"{begins}{WHOLE}"
         self._on_iteration = on_iteration or (lambda _: None)
 
     @property

@@ -38,13 +38,6 @@ _INTERRUPTED = "interrupted"
 _LOOPS = (1e-3, 0.0)
 """Periods of drives' loops that are tried where theirs is not stated: the usual one of servo drives, and none [s]. A
 delayed torque needs a loop that holds it."""
-STRUCTURE, MIXED, FOUND = "structure {:g}, ", "structure of each joint, ", "found structure, "
-"""What the stages' names begin with, with another structure of effects: of all joints, of each joint, and the best."""
-OTHER_LOOP, FINER_STEP, FURTHER, TORQUE_NOISE, POSITIONS, WEIGHED = (
-    "loop of {:g} s, ", "step of {:g} s, ", "further {}, ", "torque noise {}, ", "positions, ", "torque noise, ",
-)  # fmt: skip
-"""The same with another loop, at a finer step, where pieces had not ended, by the noise that torques have, without
-torques, and by that noise from a vector that is known."""
 _TORQUE_ATTEMPTS = 3
 """Times that the noise of torques is set."""
 _BY_CHANCE = 2.0
@@ -165,7 +158,7 @@ class Optimization:
         for attempt in range(_TORQUE_ATTEMPTS):  # what is left before a descent has ended is no noise
             if best.stop_reason == "converged":
                 break
-            best = self._way(self.problem, FURTHER.format(attempt)).begin([best.x])
+            best = self._way(self.problem, f"further {attempt}").begin([best.x])
         self.way = self._by_torque_noise(best.x)
 
     def _by_torque_noise(self, x: torch.Tensor) -> WayDown:
@@ -181,10 +174,10 @@ class Optimization:
         problem, size = self.problem, int(self.problem.space.moves.sum())
         alone: torch.Tensor | None = None
         for attempt in range(1, _TORQUE_ATTEMPTS + 1):
-            way = self._way(problem.with_torque_noise(noise), TORQUE_NOISE.format(attempt))
+            way = self._way(problem.with_torque_noise(noise), f"torque noise {attempt}")
             end = way.begin([x])
             if alone is None:
-                without = self._way(problem.with_torque_noise(dict.fromkeys(noise, np.inf)), POSITIONS)
+                without = self._way(problem.with_torque_noise(dict.fromkeys(noise, np.inf)), "positions")
                 alone = without.begin([end.x]).x
             both = self._look(way.pieces, torch.stack([end.x, alone])).positions
             (followed, best), count = both.joint_score, int(problem.dataset.train.sum())
@@ -226,7 +219,7 @@ class Optimization:
 
     def _way_at_half_the_step(self) -> WayDown:
         finer = self.problem.with_physics_dt(self.problem.physics_dt / 2)
-        return self._way(finer, FINER_STEP.format(finer.physics_dt))
+        return self._way(finer, f"step of {finer.physics_dt:g} s")
 
     def _torque_noise(self, evaluator: Evaluator, x: torch.Tensor) -> dict[str, float]:
         """What torques leave at a normalised vector (size,), by joint [N m]."""
@@ -260,15 +253,15 @@ class Optimization:
         bases = [self.problem.space.to_physical(x) for x in (best.x, self.problem.space.start)]
         tried = [(self.way, best)]
 
-        def go(values: Mapping[str, float], starts: Sequence[torch.Tensor], name: str) -> None:
-            way = self._way(self.problem.holding(values), name)
+        def go(held: Mapping[str, float], starts: Sequence[torch.Tensor], name: str) -> None:
+            way = self._way(self.problem.holding(held), name)
             tried.append((way, way.begin([way.problem.space.to_normalised(each) for each in starts])))
 
         for value in sorted({each for values in structures.values() for each in values}):
             self.progress.say(f"above the noise: fitting {', '.join(structures)} at {value:g}")
             values = {label: value if value in own else own[0] for label, own in structures.items()}
             starts = [start for base in bases for start in self.problem.at_probes(base, value)]
-            go(values, starts, STRUCTURE.format(value))
+            go(values, starts, f"structure {value:g}")
         # what each joint has left on pieces, (n,) [rad²]
         scores = [self._look(way.pieces, end.x[None]).joint_score[0] for way, end in tried]
         ends = [way.problem.space.to_physical(end.x) for way, end in tried]
@@ -278,11 +271,12 @@ class Optimization:
             left = [float(own.sum() if j is None else own[j]) for own in scores]
             mixed[entry] = ends[left.index(min(left))][entry]
         if not any(torch.equal(mixed, end) for end in ends):
-            go({label: float(mixed[self.problem.space.labels.index(label)]) for label in structures}, [mixed], MIXED)
+            values = {label: float(mixed[self.problem.space.labels.index(label)]) for label in structures}
+            go(values, [mixed], "structure of each joint")
         way, end = min(tried, key=lambda each: each[1].score)
         if way is self.way or best.score - end.score <= UNEXPLAINED * (best.score - noise):
             return best
-        found = self._way(way.problem, FOUND)  # a way that goes on has one start
+        found = self._way(way.problem, "found structure")  # a way that goes on has one start
         self._search_on(found)
         return found.begin([end.x])
 
@@ -301,7 +295,7 @@ class Optimization:
                 continue
             rate = f"at {1e-3 / period:g} kHz" if period else "continuously"
             self.progress.say(f"error above the noise: fitting drive loops that run {rate}, as none is stated")
-            other = self._way(problem.with_loop(period), OTHER_LOOP.format(period))
+            other = self._way(problem.with_loop(period), f"loop of {period:g} s")
             end = other.begin([least.x])
             if end.score < least.score:
                 found, least = other, end
@@ -312,7 +306,7 @@ class Optimization:
 
     def with_loop(self, period: float, x: torch.Tensor) -> Outcome:
         """Go on with loops of another period [s], near where a fit of pieces with it ends, normalised (size,)."""
-        other = self._way(self.problem.with_loop(period), OTHER_LOOP.format(period))
+        other = self._way(self.problem.with_loop(period), f"loop of {period:g} s")
         return self._ended(other, other.near(x, NEAR))
 
     def at_half_the_step(self, x: torch.Tensor, there: Residuals, change: torch.Tensor | None) -> Outcome | None:
@@ -371,7 +365,7 @@ class Optimization:
             x = as_vector(self.problem, self.settings.start)
             if self.problem.dataset.torques is not None:
                 noise = self._torque_noise(self.way.evaluator, x)
-                self.way = self._way(self.problem.with_torque_noise(noise), WEIGHED)
+                self.way = self._way(self.problem.with_torque_noise(noise), "torque noise")
             end = self.way.near(x, NEAR)
         else:
             stated, starts = self.way, self._without_effects_too(self._first())
