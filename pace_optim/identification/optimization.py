@@ -34,7 +34,7 @@ from pace_optim.terminal.progress import ProgressLine
 
 NEAR = LeastSquaresCfg(score_tolerance=0.02)
 """For a vector that is known to be near the best."""
-_INTERRUPTED = "interrupted"
+INTERRUPTED = "interrupted"
 _LOOPS = (1e-3, 0.0)
 """Periods of drives' loops that are tried where theirs is not stated: the usual one of servo drives, and none [s]. A
 delayed torque needs a loop that holds it."""
@@ -68,7 +68,7 @@ class Outcome:
     @property
     def is_interrupted(self) -> bool:
         """Whether that is only the best so far."""
-        return self.stop_reasons == [_INTERRUPTED]
+        return self.stop_reasons == [INTERRUPTED]
 
 
 class Optimization:
@@ -94,7 +94,7 @@ class Optimization:
         self.progress = progress
         self.history = History()
         self._restored: list[Descent] = []
-        self.searcher = make_searcher(problem.for_search(settings.device), settings)
+        self.searcher = make_searcher(problem, settings)
         self.processes = processes or Processes()
         self.colouring = colour(problem.space, problem.trees, problem.joint_names)
         self.optimizer = make_optimizer(problem, settings, self.processes) if settings.only_searches else None
@@ -121,7 +121,7 @@ class Optimization:
     def _search_on(self, way: WayDown) -> None:
         """Take a way's end for the fit's, and search with its problem."""
         self.way = way
-        self.searcher = make_searcher(self.problem.for_search(self.settings.device), self.settings)
+        self.searcher = make_searcher(self.problem, self.settings)
 
     def _ended(self, way: WayDown, end: Descent) -> Outcome:
         """The end of a way, which is the fit's."""
@@ -354,7 +354,7 @@ class Optimization:
                 raise
             x = self._best_so_far()
             self.way = next((way for way in self.ways if any(d.x is x for d in way.descents)), self.way)
-            return Outcome(x=x, stop_reasons=[_INTERRUPTED])
+            return Outcome(x=x, stop_reasons=[INTERRUPTED])
 
     def _optimize(self) -> Outcome:
         """PACE's search alone, or the way down: from the prior, or near a vector that is known."""
