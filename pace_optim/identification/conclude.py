@@ -46,10 +46,6 @@ class _End:
     """With the problem that was fitted: at the rate of the drives' loops where the recordings show it."""
     at: Assessment
     """The vector, and what noise alone leaves open."""
-    train_rmse: float
-    """Where the optimizers ended [rad]."""
-    times: float | None
-    """The same as a multiple of the noise."""
     stop_reasons: tuple[str, ...]
     left_open: list[str] = field(default_factory=list)
     """Labels of what the recordings leave open: it is at its prior."""
@@ -74,6 +70,16 @@ class _End:
         """On the training samples of the recordings that are trained on."""
         return self.at.jacobian
 
+    @cached_property
+    def rmse(self) -> dict[str, dict[str, float]]:
+        """Errors of training and validation by joint [rad]."""
+        return _rmse(self.problem, self.at.residuals)
+
+    @cached_property
+    def times(self) -> float | None:
+        """That of training as a multiple of the noise."""
+        return times_noise(self.problem, self.rmse["train"][ALL])
+
     @property
     def is_far(self) -> bool:
         """Whether that is so far above the noise that error bars mean nothing."""
@@ -96,9 +102,7 @@ class _End:
 
     def moved(self, x: torch.Tensor, held: Sequence[str] = ()) -> _End:
         """Another vector nearby, with some parameters held."""
-        at = self.at.moved(self.problem, self.way.assessor, self.way.evaluator, x, held)
-        train = _train_rmse(self.problem, at.residuals)
-        return replace(self, at=at, train_rmse=train, times=times_noise(self.problem, train))
+        return replace(self, at=self.at.moved(self.problem, self.way.assessor, self.way.evaluator, x, held))
 
 
 def conclude(
@@ -165,7 +169,6 @@ def _rmse(problem: Problem, every: Residuals) -> dict[str, dict[str, float]]:
 def _result(run: Optimization, record: EnvironmentRecord, end: _End, checked: bool = True) -> FitResult:
     """What is known so far, as a run keeps it."""
     problem, every = end.problem, end.at.residuals
-    rmse = _rmse(problem, every)
     uncertainty = end.uncertainty
     physical = problem.space.to_physical(end.x)
     open_ = set(undetermined(problem, end.x, end.uncertainty, end.is_far)) - set(uncertainty.no_influence)
@@ -188,10 +191,10 @@ def _result(run: Optimization, record: EnvironmentRecord, end: _End, checked: bo
         loop_rate=_loop_rate(end.problem, rates),
         warnings=by_effect(
             [
-                *far_end(end.times, end.train_rmse, run.settings.optimizer, problem.joint_types),
+                *far_end(end.times, end.rmse["train"][ALL], run.settings.optimizer, problem.joint_types),
                 *rough_motion(end.at.noise, float(end.jacobian.residuals.score[0])),
                 *([] if rates is None else rates.sentences(problem.space, end.known)),
-                *(fit_warnings(problem, physical, told, rmse, end.left_open, unsure) if checked else []),
+                *(fit_warnings(problem, physical, told, end.rmse, end.left_open, unsure) if checked else []),
                 *end.consistency.sentences,
             ]
         ),
@@ -211,18 +214,7 @@ def _reached(run: Optimization, outcome: Outcome) -> _End:
     way, problem = run.way, run.problem
     at = assess(problem, way.assessor, run.colouring, outcome.x, run.ended, way.evaluator)
     run.refuse_divergence(float(at.jacobian.residuals.score[0]))
-    train = _train_rmse(problem, at.residuals)
-    return _End(
-        way=way,
-        at=at,
-        train_rmse=train,
-        times=times_noise(problem, train),
-        stop_reasons=tuple(outcome.stop_reasons),
-    )
-
-
-def _train_rmse(problem: Problem, every: Residuals) -> float:
-    return rmse_by_joint(every, problem.dataset.train[every.step], problem.joint_names)[ALL]
+    return _End(way=way, at=at, stop_reasons=tuple(outcome.stop_reasons))
 
 
 def _with_loop_rate(run: Optimization, end: _End) -> _End:
