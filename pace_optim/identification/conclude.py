@@ -102,7 +102,7 @@ class _End:
 
     def moved(self, x: torch.Tensor, held: Sequence[str] = ()) -> _End:
         """Another vector nearby, with some parameters held."""
-        return replace(self, at=self.at.moved(self.problem, self.way.assessor, self.way.evaluator, x, held))
+        return replace(self, at=self.at.moved(self.way.assessor, self.way.evaluator, x, held))
 
 
 def conclude(

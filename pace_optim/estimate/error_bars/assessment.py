@@ -14,7 +14,6 @@ from pace_optim.estimate.error_bars.uncertainty import Uncertainty, estimate_unc
 from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, by_chords
 from pace_optim.problem.evaluator import Evaluator, Residuals
 from pace_optim.problem.free_phases import FreePhases
-from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 
 _MOST_LOOKS = 3
@@ -44,18 +43,15 @@ class Assessment:
     phases: FreePhases | None
     """What its residuals have taken out of free phases; ``None`` where no base moves."""
 
-    def moved(
-        self, problem: Problem, evaluator: Evaluator, training: Evaluator, x: torch.Tensor, held: Sequence[str] = ()
-    ) -> Assessment:
+    def moved(self, evaluator: Evaluator, training: Evaluator, x: torch.Tensor, held: Sequence[str] = ()) -> Assessment:
         """The same of a vector nearby, with these derivatives.
 
         Args:
-            problem: What was fitted, or the same with other facts.
             held: Labels of what is held where it is.
         """
-        residuals = training.residuals(problem.space.to_physical(x)[None])
+        residuals = training.residuals(training.space.to_physical(x)[None])
         there = replace(self.jacobian, residuals=residuals)
-        return _assessment(problem, evaluator, training, x, there, self.initial, self.noise, held)
+        return _assessment(evaluator, training, x, there, self.initial, self.noise, held)
 
 
 def assess(
@@ -95,11 +91,10 @@ def assess(
         if not blind and gained <= LeastSquaresCfg().near_enough * score:
             break
         hessian, _ = there.normal_equations()
-    return _assessment(problem, evaluator, training, x, there, initial, noise)
+    return _assessment(evaluator, training, x, there, initial, noise)
 
 
 def _assessment(
-    problem: Problem,
     evaluator: Evaluator,
     training: Evaluator,
     x: torch.Tensor,
@@ -111,10 +106,10 @@ def _assessment(
     """Error bars from derivatives at x or near it."""
     middle = None
     if training.phases is not None and there.residuals.weight is not None:
-        late = _late_forces(there, training, problem.space, x)
+        late = _late_forces(there, training, x)
         middle = _middle_of_swings(there, training.phases, training.dataset.train) + np.outer(late, late)
-    uncertainty = estimate_uncertainty(there, problem.space, x, initial.derivatives, initial.joints, held, middle)
-    physical = problem.space.to_physical(x)
+    uncertainty = estimate_uncertainty(there, training.space, x, initial.derivatives, initial.joints, held, middle)
+    physical = evaluator.space.to_physical(x)
     if evaluator.dataset.num_recordings == training.dataset.num_recordings:
         evaluator.phases = training.phases
     else:
@@ -122,7 +117,7 @@ def _assessment(
     return Assessment(
         x=x,
         uncertainty=uncertainty,
-        residuals=evaluator.residuals(physical[None], problem.dataset.sampled),
+        residuals=evaluator.residuals(physical[None], evaluator.dataset.sampled),
         jacobian=there,
         noise=noise,
         initial=initial,
@@ -161,7 +156,7 @@ def _middle_of_swings(jacobian: Jacobian, phases: FreePhases, trained: torch.Ten
     return total
 
 
-def _late_forces(jacobian: Jacobian, evaluator: Evaluator, space: ParameterSpace, x: torch.Tensor) -> np.ndarray:
+def _late_forces(jacobian: Jacobian, evaluator: Evaluator, x: torch.Tensor) -> np.ndarray:
     """Jᵀc, (size,), with c how residuals change if forces act later than a walk's rows say, by :data:`_LATE`.
 
     A joint that feels kp (q* - q) - (kd + d) q̇ of a time τ ago moves, to first order, as one with the parameters
@@ -170,7 +165,8 @@ def _late_forces(jacobian: Jacobian, evaluator: Evaluator, space: ParameterSpace
 
     of which no log shows τ. A simulator whose step h is semi-implicit logs positions that are h / 2 ahead.
     """
-    rollout, physical, slope = evaluator.rollout(1), space.to_physical(x), space.slope(x)
+    rollout, space = evaluator.rollout(1), evaluator.space
+    physical, slope = space.to_physical(x), space.slope(x)
     change, viscous = torch.zeros_like(jacobian.residuals.error[0]), space["viscous_friction"]
     for r in range(jacobian.residuals.num_recordings):
         kp, kd = torch.zeros(2, rollout.robot.num_joints, dtype=torch.float64)

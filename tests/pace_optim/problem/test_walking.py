@@ -56,7 +56,7 @@ def test_swinging_legs_have_the_truth_at_the_bottom_of_their_error(walk):
     assert float((found - truth)[problem.space["delay"]].abs().max()) * DT < 1e-3
     # error bars know of forces that act later than the rows say: d - kp τ, a - (kd + d) τ, delay + τ
     space, x = problem.space, problem.space.to_normalised(truth)
-    late = torch.as_tensor(_late_forces(jacobian, problem.training_evaluator(), space, x))
+    late = torch.as_tensor(_late_forces(jacobian, problem.training_evaluator(), x))
     hessian = jacobian.normal_equations()[0] * residuals.where.sum()
     move = torch.linalg.pinv(hessian, rtol=1e-13, hermitian=True) @ late * space.slope(x)
     assert move[space["viscous_friction"]] == pytest.approx(-40 * _LATE, rel=0.02)
