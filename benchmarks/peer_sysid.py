@@ -46,7 +46,7 @@ def run_ours(case: DriveProblem) -> Trace:
             note(descents[0].x, descents[0].score)
 
     start = torch.zeros(problem.space.size, dtype=torch.float64)
-    way = WayDown(problem, case.colouring, on_iteration=after_iteration)
+    way = WayDown(problem, on_iteration=after_iteration)
     way.noise_score = 0.0  # to the last digit
     way.run([start])
     trace.end(iterations, way.evaluator.simulated_steps + way.pieces.simulated_steps)

@@ -18,15 +18,13 @@ rattles is a small part of each change, also along a combination of parameters t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 
 from pace_optim.estimate.levenberg_marquardt import NO_INFLUENCE
 from pace_optim.problem.evaluator import Residuals
-from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.problem.parameter_space import Colouring
 
 NARROW = 1e-5
 """Normalised step of smooth simulations: as small as rounding allows."""
@@ -42,54 +40,6 @@ _AT_BOUND = 1e-3
 """A normalised entry this close to a bound is moved alone."""
 NOISE_ROWS = 2
 """Vectors beside those of the derivatives, from which the noise follows."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Colouring:
-    """Which entries of the parameter vector are perturbed together, and which joints each of them moves."""
-
-    colours: tuple[tuple[int, ...], ...]
-    """Entries perturbed together."""
-    joints: tuple[tuple[int, ...], ...]
-    """For each entry of the vector, the indices of the joints that it moves."""
-    sensors: tuple[int, ...] = ()
-    """Entries that change what sensors show, and no motion: each is perturbed without the others of its tree."""
-
-    @cached_property
-    def row_of(self) -> dict[int, int]:
-        """The colour of each entry that is not fixed, which is its row of a Jacobian."""
-        return {entry: c for c, entries in enumerate(self.colours) for entry in entries}
-
-    def moving(self, joints: Iterable[int]) -> list[int]:
-        """Entries that move any of some joints."""
-        own = set(joints)
-        return [entry for entry in self.row_of if own & set(self.joints[entry])]
-
-
-def colour(space: ParameterSpace, trees: Sequence[Sequence[str]], joint_names: Sequence[str]) -> Colouring:
-    """Group entries that move different joints: the i-th of each tree together, shared ones alone.
-
-    Entries whose bounds are equal are fixed: they belong to no colour and move no joint.
-
-    Args:
-        trees: Groups of joints that do not influence each other.
-    """
-    index = {name: i for i, name in enumerate(joint_names)}
-    owners = space.owners(trees)
-    by_tree: list[list[int]] = [[] for _ in trees]
-    alone: list[int] = []
-    free = (space.upper > space.lower).tolist()
-    for entry, owner in enumerate(owners):
-        if free[entry]:
-            (alone if owner is None else by_tree[owner]).append(entry)
-    depth = max((len(entries) for entries in by_tree), default=0)
-    colours = [tuple(entries[i] for entries in by_tree if i < len(entries)) for i in range(depth)]
-    joints = tuple(
-        tuple(index[name] for name in (joint_names if owner is None else trees[owner])) if free[entry] else ()
-        for entry, owner in enumerate(owners)
-    )
-    sensors = tuple(entry for entry, moves in enumerate(space.moves.tolist()) if not moves)
-    return Colouring(colours=(*colours, *((entry,) for entry in alone)), joints=joints, sensors=sensors)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

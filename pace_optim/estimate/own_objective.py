@@ -15,7 +15,6 @@ import torch
 
 from pace_actuators.own_code import CodeRecord, import_named, import_recorded, loaded_module, split_reference
 from pace_optim.estimate.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
-from pace_optim.estimate.derivatives import Colouring
 from pace_optim.estimate.error_bars.uncertainty import AT_BOUND, Uncertainty, uncertainty_of
 from pace_optim.problem.evaluator import Evaluator, Residuals
 from pace_optim.problem.problem import Problem
@@ -200,9 +199,7 @@ _TOGETHER = 4
 """Parts in time that are taken as one independent block."""
 
 
-def objective_error_bars(
-    objective: Objective, evaluator: Evaluator, colouring: Colouring, x: torch.Tensor
-) -> tuple[Uncertainty, float]:
+def objective_error_bars(objective: Objective, evaluator: Evaluator, x: torch.Tensor) -> tuple[Uncertainty, float]:
     """Error bars at the minimum of an objective, and its value there.
 
     With S_b the part of the objective in the b-th part of the samples, g_b its gradient and H the second derivatives
@@ -256,7 +253,7 @@ def objective_error_bars(
         spread = back @ around @ around.T @ back.T * (slopes.shape[1] / max(1, slopes.shape[1] - 1))
     samples, most = int(where.sum()), float(hessian.diagonal().max())
     scale = samples / (4 * most) if most > 0 else 1.0  # thresholds in radians are meant of what moves most
-    uncertainty = uncertainty_of(scale * hessian, scale**2 * spread, samples, colouring, space, x)
+    uncertainty = uncertainty_of(scale * hessian, scale**2 * spread, samples, evaluator.colouring, space, x)
     return uncertainty, float(parts(x[None]).sum())
 
 

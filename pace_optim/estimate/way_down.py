@@ -23,7 +23,6 @@ from dataclasses import dataclass, field, replace
 
 import torch
 
-from pace_optim.estimate.derivatives import Colouring
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
 from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, least_squares
 from pace_optim.problem.problem import Problem
@@ -65,7 +64,6 @@ class WayDown:
     def __init__(
         self,
         problem: Problem,
-        colouring: Colouring,
         *,
         cfg: WayDownCfg | None = None,
         on_iteration: Callable[[Sequence[Descent]], None] | None = None,
@@ -79,7 +77,6 @@ class WayDown:
         """
         self.cfg = cfg or WayDownCfg()
         self.problem = problem
-        self.colouring = colouring
         self.evaluator = problem.training_evaluator()
         """On the recordings that are trained on."""
         self.pieces = problem.on_pieces(self.cfg.share).training_evaluator()
@@ -148,7 +145,7 @@ class WayDown:
         """Let a stage's descents end; returns the best."""
         evaluator = self.pieces if stage == self.stages[0] else self.evaluator
         cfg = replace(cfg, noise_score=self.noise_score)
-        return least_squares(evaluator, self.colouring, self._of(stage), cfg, self._on_iteration)[0]
+        return least_squares(evaluator, self._of(stage), cfg, self._on_iteration)[0]
 
     def _best_on_whole(self, starts: Sequence[torch.Tensor]) -> Descent:
         """A descent that begins at the end on pieces, or the start, whose score on the whole recordings is lowest."""

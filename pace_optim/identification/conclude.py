@@ -212,7 +212,7 @@ def _loop_rate(problem: Problem, rates: LoopRates | None) -> dict[str, Any]:
 def _reached(run: Optimization, outcome: Outcome) -> _End:
     """Where the optimizers ended, with error bars."""
     way, problem = run.way, run.problem
-    at = assess(problem, way.assessor, run.colouring, outcome.x, run.ended, way.evaluator)
+    at = assess(problem, way.assessor, outcome.x, run.ended, way.evaluator)
     run.refuse_divergence(float(at.jacobian.residuals.score[0]))
     return _End(way=way, at=at, stop_reasons=tuple(outcome.stop_reasons))
 
@@ -300,7 +300,7 @@ def conclude_own(run: Optimization, record: EnvironmentRecord, outcome: Outcome)
     physical, validation = problem.space.to_physical(x), problem.dataset.validation
     every = objective.residuals(way.assessor, physical)
     run.refuse_divergence(float(every.score[0]))
-    uncertainty, score = objective_error_bars(objective, way.evaluator, run.colouring, x)
+    uncertainty, score = objective_error_bars(objective, way.evaluator, x)
     held_out = float(objective.errors(way.assessor, physical[None], validation).sum()) if validation.any() else None
     run.folder.write_tensors("best_trajectory.pt", trajectories(problem, every))
     _write_drives(run, way, x)

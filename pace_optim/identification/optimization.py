@@ -13,7 +13,6 @@ from pace_actuators.effects import effect_cfgs
 from pace_actuators.joint_units import units_for
 from pace_optim.estimate.cmaes_optimizer import CMAESOptimizer
 from pace_optim.estimate.comb_scan import scanned
-from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
 from pace_optim.estimate.error_bars.loop_rate import UNEXPLAINED
 from pace_optim.estimate.error_bars.uncertainty import torque_noise
@@ -96,7 +95,6 @@ class Optimization:
         self._restored: list[Descent] = []
         self.searcher = make_searcher(problem, settings)
         self.processes = processes or Processes()
-        self.colouring = colour(problem.space, problem.trees, problem.joint_names)
         self.optimizer = make_optimizer(problem, settings, self.processes) if settings.only_searches else None
         self._around = torch.zeros(0, dtype=torch.float64)
         """Physical parameters around which a hybrid searches, (size,); empty before."""
@@ -113,7 +111,7 @@ class Optimization:
 
     def _way(self, problem: Problem, name: str = "") -> WayDown:
         """The way down with a problem, as far as an interrupted run had gone it."""
-        way = WayDown(problem, self.colouring, on_iteration=self._after_iteration, name=name)
+        way = WayDown(problem, on_iteration=self._after_iteration, name=name)
         way.descents = [d for d in self._restored if d.stage in way.stages]
         self.ways.append(way)
         return way

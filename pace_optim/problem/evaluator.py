@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import torch
 
 from pace_envs.tasks.pace import TORQUE_OFFSET, TORQUE_SCALE
 from pace_optim.problem.free_phases import FreePhases, PhaseProbes, free_phases
-from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.problem.parameter_space import Colouring, ParameterSpace, colour
 from pace_optim.problem.rollout import Rollout
 from pace_optim.recording.dataset import Dataset, Torques
 from pace_optim.recording.noise import LEAST_NOISE, noise_variance
@@ -133,7 +134,8 @@ class Evaluator:
         self.dataset = dataset
         self.space = space
         names = dataset.recordings[0].joint_names
-        self._trees = [[names.index(name) for name in tree] for tree in trees or [names]]
+        self._tree_names = trees or [names]
+        self._trees = [[names.index(name) for name in tree] for tree in self._tree_names]
         self.phases = phases
         """What is not known of free phases; ``None`` where no base moves, or no candidate has been simulated yet."""
         self._phases_at: torch.Tensor | None = None
@@ -141,6 +143,11 @@ class Evaluator:
         self._make_env = make_env
         self._nearby = nearby
         self._rollouts: dict[int, Rollout] = {}
+
+    @cached_property
+    def colouring(self) -> Colouring:
+        """Which entries are perturbed together."""
+        return colour(self.space, self._tree_names, self.dataset.recordings[0].joint_names)
 
     @property
     def looks_coarser(self) -> bool:

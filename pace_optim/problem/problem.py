@@ -45,7 +45,7 @@ from pace_optim.problem.log_and_robot import (
     without_loops_of_torques,
 )
 from pace_optim.problem.moving_base import BasePath, base_path, on_moving_base
-from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.problem.parameter_space import Colouring, ParameterSpace, colour
 from pace_optim.problem.recordings import Logs, conform_all, motors_of_logs, read_logs, tell_on_stderr
 from pace_optim.problem.unknown_facts import GAINS, LIMITS, lift_limits, refined_limits, with_unknown
 from pace_optim.recording import Recording
@@ -147,6 +147,11 @@ class Problem:
         """The same recordings with other effects."""
         cfg = _configured(self.plain_cfg, self.physics_dt, effects)
         return replace(self, env_cfg=cfg, space=ParameterSpace.of(cfg.sim2real))
+
+    @cached_property
+    def colouring(self) -> Colouring:
+        """Which entries are perturbed together."""
+        return colour(self.space, self.trees, self.joint_names)
 
     @property
     def structures(self) -> dict[str, tuple[float, ...]]:

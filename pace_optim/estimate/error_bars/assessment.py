@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from pace_optim.estimate.derivatives import TIMES_NOISE, Colouring, Jacobian, Stencil, stencil
+from pace_optim.estimate.derivatives import TIMES_NOISE, Jacobian, Stencil, stencil
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty, estimate_uncertainty
 from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, by_chords
 from pace_optim.problem.evaluator import Evaluator, Residuals
@@ -57,7 +57,6 @@ class Assessment:
 def assess(
     problem: Problem,
     evaluator: Evaluator,
-    colouring: Colouring,
     x: torch.Tensor,
     ended: Descent | None = None,
     training: Evaluator | None = None,
@@ -77,7 +76,7 @@ def assess(
     ended_early = ended is not None and bool(ended.stop_reason) and training.looks_coarser
     for _ in range(1 + _MOST_LOOKS):
         training.look_at_phases(problem.space.to_physical(x), anew=True)
-        around = stencil(x, colouring, hessian, noise, score)
+        around = stencil(x, training.colouring, hessian, noise, score)
         shake = max(_INITIAL_STEP, min(TIMES_NOISE * noise, score**0.5))
         probes = make_probes(x, around, problem.trees, problem.joint_names, shake)
         here, every = training.look_around(

@@ -11,7 +11,7 @@ import torch
 from pace_actuators.text import capitalised, plural
 from pace_envs import ManagerBasedEnv
 from pace_envs.tasks.pace import GLOBAL, Parameter
-from pace_optim.estimate.derivatives import Jacobian, colour, stencil
+from pace_optim.estimate.derivatives import Jacobian, stencil
 from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty
@@ -107,14 +107,13 @@ class _Fit:
 def _fit_from(problem: Problem, x: torch.Tensor, there: Jacobian | None = None) -> _Fit:
     """Least squares from x, where the derivatives may be known."""
     evaluator = problem.training_evaluator()
-    colouring = colour(problem.space, problem.trees, problem.joint_names)
     start = Descent(x=x.clamp(-1.0, 1.0).clone())
     if there is not None:
         start.jacobian, (start.hessian, start.gradient) = there, there.normal_equations()
         start.scores = [float(there.residuals.score[0])]
     cfg = replace(_REFINE, noise_score=noise_score(problem))
-    best = least_squares(evaluator, colouring, [start], cfg)[0]
-    known = assess(problem, evaluator, colouring, best.x, ended=best, training=evaluator)
+    best = least_squares(evaluator, [start], cfg)[0]
+    known = assess(problem, evaluator, best.x, ended=best, training=evaluator)
     score = float(known.jacobian.residuals.score[0])
     return _Fit(score=score, x=known.x, uncertainty=known.uncertainty, simulated_steps=evaluator.simulated_steps)
 
@@ -240,11 +239,10 @@ def _by_promise(problem: Problem, x: torch.Tensor) -> tuple[list[int], int]:
     """
     problem, x = _with_gains(problem, x, range(problem.dataset.num_recordings))
     evaluator = problem.training_evaluator()
-    colouring = colour(problem.space, problem.trees, problem.joint_names)
-    around = stencil(x, colouring)
+    around = stencil(x, evaluator.colouring)
     there = around.jacobian(evaluator.residuals(problem.space.to_physical(torch.cat([x[None], around.vectors]))))
     gains = {problem.space.slices[name].start for name in _GAINS.values()}
-    rows = sorted({colouring.row_of[entry] for entry in gains})
+    rows = sorted({evaluator.colouring.row_of[entry] for entry in gains})
     falls = []
     for r in range(problem.dataset.num_recordings):
         columns = there.columns.clone()

@@ -248,7 +248,7 @@ def _refitted(
     x, near, gains = by_chords(evaluator, x, replace(there, residuals=begin), _LEFT)
     if gains:
         hessian, _ = near.normal_equations()
-        x = least_squares(evaluator, there.colouring, [Descent(x=x, hessian=hessian)], _REFIT)[0].x
+        x = least_squares(evaluator, [Descent(x=x, hessian=hessian)], _REFIT)[0].x
         near = replace(near, residuals=evaluator.residuals(space.to_physical(x)[None]))
     residuals = near.residuals
     return _Refit(x=x, score=float(residuals.score), values=space.to_physical(x).numpy(), error=residuals.error[0])

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from scipy import signal
 
-from pace_optim.estimate.derivatives import Colouring, Jacobian
+from pace_optim.estimate.derivatives import Jacobian
 from pace_optim.problem.evaluator import Residuals
-from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.problem.parameter_space import Colouring, ParameterSpace
 from pace_optim.recording.dataset import Torques
 
 AT_BOUND = 1e-3

@@ -14,7 +14,6 @@ from pace_actuators.base_parameters import CARRIED, PER_JOINT
 from pace_actuators.effects import effect_cfgs
 from pace_actuators.text import plural
 from pace_envs.tasks.pace import GLOBAL
-from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
 from pace_optim.estimate.error_bars.uncertainty import (
     HARDLY_KNOWN,
@@ -165,11 +164,11 @@ def _fitted_beside(problem: Problem, x: torch.Tensor, labels: list[str], cfg: Le
     """The vector with some entries at their prior and the rest fitted again; ``None`` where it is not as good."""
     physical = problem.space.to_physical(at_prior(problem, x, labels))
     held = replace(problem, space=problem.space.holding(labels, physical))
-    evaluator, colouring = held.training_evaluator(), colour(held.space, held.trees, held.joint_names)
+    evaluator = held.training_evaluator()
     tolerance = min(cfg.score_tolerance, AS_GOOD)  # as finely as it is judged
     cfg = replace(cfg, score_tolerance=tolerance, noise_score=noise_score(problem))
     before = float(evaluator.residuals(problem.space.to_physical(x)[None]).score[0])
-    best = least_squares(evaluator, colouring, [held.space.to_normalised(physical)], cfg)[0]
+    best = least_squares(evaluator, [held.space.to_normalised(physical)], cfg)[0]
     if best.score > (1 + AS_GOOD) * before:
         return None
     return problem.space.to_normalised(held.space.to_physical(best.x))

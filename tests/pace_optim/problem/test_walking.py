@@ -10,7 +10,7 @@ from walking import DT, crawler, walking_problem, write_log
 
 from pace_envs import ManagerBasedRLEnv, load_env_cfg
 from pace_envs.compiler import host
-from pace_optim.estimate.derivatives import colour, stencil
+from pace_optim.estimate.derivatives import stencil
 from pace_optim.estimate.error_bars.assessment import _LATE, _late_forces
 from pace_optim.problem.free_phases import FreePhases, encoder_noise
 from pace_optim.problem.moving_base import base_path, imu_pose, joints_of_feet, on_moving_base
@@ -36,7 +36,7 @@ def at_once(monkeypatch):
 def steps_of(problem, x):
     """Where one Gauss-Newton step from x leads, physical (size,)."""
     evaluator, space = problem.training_evaluator(), problem.space
-    around = stencil(x, colour(space, problem.trees, problem.joint_names), first=3e-3)
+    around = stencil(x, problem.colouring, first=3e-3)
     residuals = evaluator.residuals(space.to_physical(torch.cat([x[None], around.vectors])))
     hessian, gradient = around.jacobian(residuals).normal_equations()
     scale = hessian.diagonal().clamp(min=1e-30).sqrt()

@@ -8,7 +8,6 @@ import torch
 from problems import BENCH, CALM, chirp, env_cfg, make_problem, record, replayed
 
 from pace_envs.task_source import EnvironmentRecord
-from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.error_bars.loop_rate import LoopRates, _against, _lagrange, loop_rates
 from pace_optim.estimate.least_squares import LeastSquaresCfg, least_squares
@@ -34,10 +33,10 @@ def recorded_at(period, duration=1.0, noise=1e-4):
 
 def fitted(problem):
     """Where a fit from the truth ends, and what is known there."""
-    colouring, evaluator = colour(problem.space, problem.trees, problem.joint_names), problem.training_evaluator()
+    evaluator = problem.training_evaluator()
     start = problem.space.to_normalised(problem.space.from_dict(CALM))
-    best = least_squares(evaluator, colouring, [start], LeastSquaresCfg(max_iteration=8))[0]
-    return best.x, assess(problem, evaluator, colouring, best.x)
+    best = least_squares(evaluator, [start], LeastSquaresCfg(max_iteration=8))[0]
+    return best.x, assess(problem, evaluator, best.x)
 
 
 def test_a_recording_of_a_simulation_with_the_assumed_rate_and_this_very_step_says_nothing_of_others():
