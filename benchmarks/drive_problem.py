@@ -14,7 +14,6 @@ import torch
 
 from pace_envs import load_env_cfg
 from pace_envs.manager_based_rl_env import ManagerBasedRLEnv
-from pace_optim.estimate.derivatives import Colouring, colour
 from pace_optim.problem.kinematic_trees import independent_trees
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
@@ -35,8 +34,6 @@ class DriveProblem:
     """Physical vector, (size,)."""
     fitted: torch.Tensor
     """Indices of the fitted entries: armature, viscous friction, friction of every joint, (36,)."""
-    colouring: Colouring
-    """Of the fitted entries only."""
 
     @property
     def recording(self) -> Recording:
@@ -88,8 +85,7 @@ def drive_problem(steps: int = 8000) -> DriveProblem:
     )
     env.close()
     fitted = torch.cat([torch.arange(space.size)[space[name]] for name in FITTED])
-    colouring = colour(space, trees, problem.joint_names)
-    return DriveProblem(problem=problem, truth=truth, fitted=fitted, colouring=colouring)
+    return DriveProblem(problem=problem, truth=truth, fitted=fitted)
 
 
 def _simulated(

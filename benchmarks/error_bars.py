@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.least_squares import least_squares
 from pace_optim.problem.problem import Problem, load_problem
@@ -28,11 +27,11 @@ def one_seed(problem: Problem, seed: int, noise: float, bits: int) -> tuple[np.n
     noisy = recording.dof_pos + noise * generator.standard_normal(recording.dof_pos.shape)
     measured = dataclasses.replace(recording, dof_pos=np.round(noisy / lattice) * lattice, dof_vel=None)
     seeded = dataclasses.replace(problem, dataset=make_dataset([measured]))
-    evaluator, colouring = seeded.evaluator(), colour(seeded.space, seeded.trees, seeded.joint_names)
+    evaluator = seeded.evaluator()
     truth = seeded.space.from_dict(seeded.env_cfg.sim2real.sample_params)
     # every start ends in the same minimum; this one saves iterations
-    best = least_squares(evaluator, colouring, [seeded.space.to_normalised(truth)])[0]
-    uncertainty = assess(seeded, evaluator, colouring, best.x).uncertainty
+    best = least_squares(evaluator, [seeded.space.to_normalised(truth)])[0]
+    uncertainty = assess(seeded, evaluator, best.x).uncertainty
     return (seeded.space.to_physical(best.x) - truth).numpy(), uncertainty.std
 
 

@@ -22,7 +22,7 @@ from drive_problem import DriveProblem, drive_problem
 from solver_trace import Trace, machine, table, write_json
 from sysid_peer import Peer
 
-from pace_optim.estimate.way_down import WHOLE, WayDown, WayDownCfg
+from pace_optim.estimate.way_down import WHOLE, WayDown
 from pace_optim.terminal.cli import run_cli
 
 OURS = "pace least_squares"
@@ -33,12 +33,11 @@ def run_ours(case: DriveProblem) -> Trace:
     """Identify with our least squares from the centre of the bounds."""
     problem = case.problem
     trace = Trace(solver=OURS)
-    evaluator, pieces = problem.evaluator(), problem.on_pieces(WayDownCfg().share).training_evaluator()
     iterations = 0
 
     def note(x: torch.Tensor, score: float) -> None:
         error = case.relative_error(problem.space.to_physical(x)[case.fitted])
-        trace.add(score, error, evaluator.simulated_steps + pieces.simulated_steps)
+        trace.add(score, error, way.evaluator.simulated_steps + way.pieces.simulated_steps)
 
     def after_iteration(descents: list[Any]) -> None:
         nonlocal iterations
@@ -47,8 +46,10 @@ def run_ours(case: DriveProblem) -> Trace:
             note(descents[0].x, descents[0].score)
 
     start = torch.zeros(problem.space.size, dtype=torch.float64)
-    WayDown(evaluator, case.colouring, pieces=pieces, on_iteration=after_iteration).run([start])
-    trace.end(iterations, evaluator.simulated_steps + pieces.simulated_steps)
+    way = WayDown(problem, on_iteration=after_iteration)
+    way.noise_score = 0.0  # to the last digit
+    way.run([start])
+    trace.end(iterations, way.evaluator.simulated_steps + way.pieces.simulated_steps)
     return trace
 
 

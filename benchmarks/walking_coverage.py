@@ -18,9 +18,9 @@ import torch
 from walking_plant import CONTROL, crawler, drawn, gait
 
 from pace_envs import load_env_cfg
-from pace_optim.estimate.derivatives import colour, stencil
+from pace_optim.estimate.derivatives import stencil
 from pace_optim.estimate.error_bars.assessment import assess
-from pace_optim.estimate.error_bars.undetermined import change_without_step, step_share
+from pace_optim.estimate.error_bars.physics_step import change_without_step, step_share
 from pace_optim.problem.problem import Problem, load_problem
 
 COVERED = 2.0
@@ -59,7 +59,7 @@ def walk(folder: Path, seed: int, duration: float, late: float = 0.0) -> tuple[P
 def distances(problem: Problem, truth: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
     """Errors of the values, physical, and their error bars, (size,) each."""
     space, evaluator = problem.space, problem.training_evaluator()
-    colouring = colour(space, problem.trees, problem.joint_names)
+    colouring = problem.colouring
     x = space.to_normalised(truth)
     for _ in range(_STEPS):
         evaluator.look_at_phases(space.to_physical(x), anew=True)
@@ -69,7 +69,7 @@ def distances(problem: Problem, truth: torch.Tensor) -> tuple[np.ndarray, np.nda
         scale = hessian.diagonal().clamp(min=1e-30).sqrt()
         whole = torch.linalg.pinv(hessian / scale[:, None] / scale, rtol=1e-7, hermitian=True)
         x = (x - whole @ (gradient / scale) / scale).clamp(-1.0, 1.0)
-    there = assess(problem, problem.evaluator(), colouring, x)
+    there = assess(problem, problem.evaluator(), x)
     physical, bars = space.to_physical(x), there.uncertainty
     change = change_without_step(problem, physical, there.jacobian.residuals, there.phases)
     if change is not None:

@@ -20,8 +20,7 @@ from pace_optim.diagnosis.settings import DiagnosisSettings
 from pace_optim.diagnosis.wrong_links import LinkFindings, find_wrong_links
 from pace_optim.identification.fit import fit
 from pace_optim.joints.fits.fits import fits_on
-from pace_optim.joints.fits.labels import labels
-from pace_optim.joints.fits.model import whole_values
+from pace_optim.joints.fits.model import labels, whole_values
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.unknown_facts import started_from, with_identified
 from pace_optim.report import check_folder, report_text

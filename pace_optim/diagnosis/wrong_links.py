@@ -30,7 +30,7 @@ from pace_actuators.text import conjoined, plural
 from pace_envs.link_inertia import NAMES, OF_BODY, PARTS, TEN, UNITS, Reference
 from pace_envs.tasks.pace import sought_links
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg, LinksCfg
-from pace_optim.estimate.derivatives import Colouring, colour, stencil
+from pace_optim.estimate.derivatives import stencil
 from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
 from pace_optim.estimate.error_bars.uncertainty import SURE, inverse_of
@@ -169,7 +169,7 @@ def _told(base: _Fitted, now: _Fitted, found: Sequence[Reference]) -> LinkFindin
     """What was found, with error bars."""
     problem, space = now.problem, now.problem.space
     values = space.to_dict(space.to_physical(now.x))
-    known = assess(problem, problem.evaluator(), _colouring(problem), now.x)
+    known = assess(problem, problem.evaluator(), now.x)
     std = space.to_dict(torch.as_tensor(known.uncertainty.std))
     wrong = [
         WrongLink(
@@ -311,8 +311,8 @@ def listed_candidates(promising: Sequence[tuple[float, Reference]], cfg: LinksCf
 
 def _look(problem: Problem, x: torch.Tensor, cfg: LinksCfg) -> tuple[torch.Tensor, torch.Tensor, float]:
     """H, g and the score [rad²] at a normalised vector, on pieces."""
-    pieces, colouring = problem.on_pieces(cfg.share), _colouring(problem)
-    around = stencil(x, colouring, first=cfg.step)
+    pieces = problem.on_pieces(cfg.share)
+    around = stencil(x, problem.colouring, first=cfg.step)
     vectors = torch.cat([x[None], around.vectors])
     residuals = pieces.training_evaluator().residuals(problem.space.to_physical(vectors))
     return *around.jacobian(residuals).normal_equations(), float(residuals.rows(0, 1).score)
@@ -429,7 +429,7 @@ def _fit(
         near.loosest_tolerance = near.loosest_enough = cfg.explains
     stage = problem if whole else problem.on_pieces(cfg.share)
     start = _values_in(problem, values)
-    x = least_squares(stage.training_evaluator(), _colouring(problem), [start], near)[0].x
+    x = least_squares(stage.training_evaluator(), [start], near)[0].x
     return _Fitted(problem, x, _held_out(problem, problem.space.to_physical(x)))
 
 
@@ -453,7 +453,3 @@ def _held_out(problem: Problem, physical: torch.Tensor) -> float:
     """RMSE of all joints on samples that are not trained on [rad]."""
     residuals = problem.evaluator().residuals(physical[None], problem.dataset.validation)
     return float(residuals.joint_score[0].mean() ** 0.5)
-
-
-def _colouring(problem: Problem) -> Colouring:
-    return colour(problem.space, problem.trees, problem.joint_names)

@@ -57,9 +57,9 @@ class CMAESOptimizerCfg(Config):
 class TreeSearch:
     """The strategies of all trees: vectors are drawn, and learnt from their scores; no simulator is known here.
 
-    With several trees each has its own strategy on the same rollouts. Shared parameters (the delay) are searched by
-    each tree on its own until the trees know theirs well; then the one value with the lowest total score is taken for
-    all, and the search goes on with it.
+    With several trees (groups of joints that do not influence each other) each has its own strategy on the same
+    rollouts. Shared parameters (the delay) are searched by each tree on its own until the trees know theirs well; then
+    the one value with the lowest total score is taken for all, and the search goes on with it.
     """
 
     def __init__(
@@ -288,10 +288,6 @@ class CMAESOptimizer(TreeSearch):
                 error_vel = torch.sum((self.sim_dof_vel - self.real_dof_vel) ** 2, dim=1)
                 self.scores += 0.7 * error_pos + 0.3 * error_vel
 
-    With several trees (groups of joints that do not influence each other), each has its own strategy on the same
-    rollouts. Shared parameters (the delay) are searched by each tree on its own until the trees know theirs well;
-    then the one value with the lowest total score is taken for all, and the search goes on with it.
-
     Attributes:
         armature_idx, damping_idx, friction_idx, bias_idx, delay_idx: Slices of the parameter vector.
         sim_params: Physical parameters of every environment, (num_envs, size); set by :meth:`update_simulator`.
@@ -335,7 +331,6 @@ class CMAESOptimizer(TreeSearch):
         self.armature_idx, self.damping_idx = space["armature"], space["viscous_friction"]
         self.friction_idx, self.bias_idx = space["friction"], space["encoder_bias"]
         self.delay_idx = space["delay"]
-        self._shown_here = self.num_shown
         self.sim_params = torch.empty(0)
         self.scores_buffer: torch.Tensor | None = None
         self.rollout: Rollout | None = None
@@ -358,10 +353,9 @@ class CMAESOptimizer(TreeSearch):
             ValueError: If the rollout is of another number of candidates.
         """
         mine = self.processes.share(self.population_size)
-        self._shown_here = len(range(*mine.indices(self.population_size)))
-        if rollout.num_candidates != self._shown_here:
+        if rollout.num_candidates != self.num_shown:
             raise ValueError(
-                f"There are {self._shown_here} candidates of a generation to simulate here, but the rollout simulates "
+                f"There are {self.num_shown} candidates of a generation to simulate here, but the rollout simulates "
                 f"{rollout.num_candidates}. Take evaluator.rollout(optimizer.num_shown)."
             )
         rollout.start(self.candidates[mine], self.where, per_joint=self._per_joint_copies(mine))
@@ -500,7 +494,7 @@ class CMAESOptimizer(TreeSearch):
 
     def _by_joint(self, scores: Any) -> torch.Tensor:
         """Scores of the environments, (num_envs, n), as those of the candidates of this process, (candidates, n)."""
-        return scores.view(self._shown_here, -1, len(self.joint_names)).sum(dim=1)
+        return scores.view(self.num_shown, -1, len(self.joint_names)).sum(dim=1)
 
     def _of_all(self, scores: torch.Tensor) -> torch.Tensor:
         """The scores of all candidates, from this process's own, on the processor."""

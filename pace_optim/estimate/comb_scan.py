@@ -20,9 +20,6 @@ def scanned(
 
     At every frequency of a grid the error e is regressed on what a sine and a cosine change, joint by joint: the
     amplitudes follow from the best one. All joints are moved at once: what one of them does to another counts little.
-
-    Args:
-        x: The end of a descent, normalised (size,).
     """
     result = None
     for cfg in (each for each in effects if each.effect_class.comb is not None):

@@ -18,14 +18,13 @@ rattles is a small part of each change, also along a combination of parameters t
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 
 from pace_optim.estimate.levenberg_marquardt import NO_INFLUENCE
 from pace_optim.problem.evaluator import Residuals
-from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.problem.parameter_space import Colouring
 
 NARROW = 1e-5
 """Normalised step of smooth simulations: as small as rounding allows."""
@@ -43,44 +42,6 @@ NOISE_ROWS = 2
 """Vectors beside those of the derivatives, from which the noise follows."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Colouring:
-    """Which entries of the parameter vector are perturbed together, and which joints each of them moves."""
-
-    colours: tuple[tuple[int, ...], ...]
-    """Entries perturbed together."""
-    joints: tuple[tuple[int, ...], ...]
-    """For each entry of the vector, the indices of the joints that it moves."""
-    sensors: tuple[int, ...] = ()
-    """Entries that change what sensors show, and no motion: each is perturbed without the others of its tree."""
-
-
-def colour(space: ParameterSpace, trees: Sequence[Sequence[str]], joint_names: Sequence[str]) -> Colouring:
-    """Group entries that move different joints: the i-th of each tree together, shared ones alone.
-
-    Entries whose bounds are equal are fixed: they belong to no colour and move no joint.
-
-    Args:
-        trees: Groups of joints that do not influence each other.
-    """
-    index = {name: i for i, name in enumerate(joint_names)}
-    owners = space.owners(trees)
-    by_tree: list[list[int]] = [[] for _ in trees]
-    alone: list[int] = []
-    free = (space.upper > space.lower).tolist()
-    for entry, owner in enumerate(owners):
-        if free[entry]:
-            (alone if owner is None else by_tree[owner]).append(entry)
-    depth = max((len(entries) for entries in by_tree), default=0)
-    colours = [tuple(entries[i] for entries in by_tree if i < len(entries)) for i in range(depth)]
-    joints = tuple(
-        tuple(index[name] for name in (joint_names if owner is None else trees[owner])) if free[entry] else ()
-        for entry, owner in enumerate(owners)
-    )
-    sensors = tuple(entry for entry, moves in enumerate(space.moves.tolist()) if not moves)
-    return Colouring(colours=(*colours, *((entry,) for entry in alone)), joints=joints, sensors=sensors)
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Stencil:
     """Vectors around x whose residuals give the derivatives and the noise there."""
@@ -96,10 +57,9 @@ class Stencil:
         colouring = self.colouring
         change = residuals.error[1 : 1 + len(colouring.colours)] - residuals.error[:1]
         columns = torch.zeros_like(change)
-        row_of = {entry: c for c, entries in enumerate(colouring.colours) for entry in entries}
         for joint in range(change.shape[-1]):
-            entries = [entry for entry in row_of if joint in colouring.joints[entry]]
-            rows, at = [row_of[entry] for entry in entries], torch.tensor(entries)
+            entries = colouring.moving([joint])
+            rows, at = [colouring.row_of[entry] for entry in entries], torch.tensor(entries)
             length = self.steps[at[:, None], at].norm(dim=1).clamp(min=1e-300)
             changes = change[rows, ..., joint].flatten(1) / length[:, None]
             known = changes.isfinite().all(dim=1, keepdim=True)  # a vector may diverge: its direction is left out
@@ -127,7 +87,6 @@ def stencil(
     """Where to look around x.
 
     Args:
-        x: Normalised vector, (size,).
         hessian: JᵀJ as it is known, (size, size), of which the principal directions are; ``None``: each entry alone.
         noise: The simulation's own noise, as :meth:`Stencil.noise` has it [rad].
         score: The score at x [rad²].
@@ -210,11 +169,9 @@ class Jacobian:
     def column(self, entry: int) -> torch.Tensor:
         """Derivative of the error by an entry, (K, R, n); zero for joints that the entry does not move."""
         result = torch.zeros_like(self.residuals.error[0])
-        row = next((c for c, entries in enumerate(self.colouring.colours) if entry in entries), None)
-        if row is None:  # its bounds are equal
-            return result
-        joints = list(self.colouring.joints[entry])
-        result[..., joints] = self.columns[row][..., joints]
+        if entry in self.colouring.row_of:  # else its bounds are equal
+            joints = list(self.colouring.joints[entry])
+            result[..., joints] = self.columns[self.colouring.row_of[entry]][..., joints]
         return result
 
     def times(self, vector: torch.Tensor) -> torch.Tensor:
@@ -244,7 +201,7 @@ class Jacobian:
         """JᵀJ (size, size) and Jᵀr (size,) with the prior's, divided by the number of samples as the score is."""
         size = len(self.colouring.joints)
         hessian, gradient = torch.zeros(size, size, dtype=torch.float64), torch.zeros(size, dtype=torch.float64)
-        row_of = {entry: c for c, entries in enumerate(self.colouring.colours) for entry in entries}
+        row_of = self.colouring.row_of
         for joint in range(self.columns.shape[-1]):
             entries = [entry for entry in range(size) if joint in self.colouring.joints[entry]]
             # products are rounded by layout: contiguous, they are the same whatever these are views of
@@ -255,6 +212,6 @@ class Jacobian:
             hessian[at[:, None], at] += block @ block.T
             gradient[at] += block @ error
         if (prior := self.residuals.prior) is not None:
-            hessian, gradient = hessian + prior.hessian, gradient + prior.gradient
+            hessian, gradient = hessian + prior.hessian, gradient + prior.gradient_at(prior.x[0])
         samples = self.residuals.where.sum()
         return hessian / samples, gradient / samples

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from pace_actuators.files import checked
-from pace_optim.estimate.derivatives import NOISE_ROWS, Colouring, Jacobian, stencil
+from pace_optim.estimate.derivatives import NOISE_ROWS, Jacobian, stencil
 from pace_optim.estimate.levenberg_marquardt import DAMPING_TRIALS, FIRST_DAMPING, LinearModel, next_damping
 from pace_optim.problem.evaluator import Evaluator, Residuals
 
@@ -145,16 +145,14 @@ class Descent(DescentState):
             for state, (x, hessian, gradient) in zip(states, known, strict=True)
         ]
 
-    def look(
-        self, evaluator: Evaluator, colouring: Colouring, where: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor, Jacobian | None]:
+    def look(self, evaluator: Evaluator) -> tuple[torch.Tensor, torch.Tensor, Jacobian | None]:
         """H and g at x; where they are not known, they, the noise and J are taken."""
         renewed = evaluator.look_at_phases(evaluator.space.to_physical(self.x), anew=True)
         if self.hessian is not None and self.gradient is not None:
             return self.hessian, self.gradient, self.jacobian
-        around = stencil(self.x, colouring, self.hessian, self.noise, self.score)
+        around = stencil(self.x, evaluator.colouring, self.hessian, self.noise, self.score)
         vectors = torch.cat([self.x[None], around.vectors])
-        here, residuals = evaluator.look_around(evaluator.space.to_physical(vectors), where, self.own_step)
+        here, residuals = evaluator.look_around(evaluator.space.to_physical(vectors), own_step=self.own_step)
         self.simulations += len(vectors)
         score = float(here.score[0])
         if not self.scores and math.isfinite(score):
@@ -184,20 +182,15 @@ def checkpoint_of(descents: Sequence[Descent]) -> dict[str, np.ndarray]:
 
 def least_squares(
     evaluator: Evaluator,
-    colouring: Colouring,
     starts: Sequence[torch.Tensor | Descent],
     cfg: LeastSquaresCfg | None = None,
     on_iteration: Callable[[list[Descent]], None] | None = None,
-    where: torch.Tensor | None = None,
 ) -> list[Descent]:
     """Refine starts, one after the other, to the nearest minimum of the score.
 
     Args:
-        colouring: Which entries are perturbed together.
         starts: Normalised vectors, (size,), or descents to go on with.
-        cfg: When a descent ends.
         on_iteration: Called with all descents after each iteration; it may raise KeyboardInterrupt to stop.
-        where: Which samples count, (T, R) bool; ``None`` means those to train on.
 
     Returns:
         The descents, the best first.
@@ -206,19 +199,17 @@ def least_squares(
     descents = [start if isinstance(start, Descent) else Descent(x=start.clamp(-1.0, 1.0).clone()) for start in starts]
     for i, descent in enumerate(descents):
         while not descent.stop_reason:
-            _iterate(descent, evaluator, colouring, cfg, where)
+            _iterate(descent, evaluator, cfg)
             _give_up(descent, descents[:i], cfg)
             if on_iteration is not None:
                 on_iteration(descents)
     return sorted(descents, key=lambda d: d.score)
 
 
-def _iterate(
-    descent: Descent, evaluator: Evaluator, colouring: Colouring, cfg: LeastSquaresCfg, where: torch.Tensor | None
-) -> None:
+def _iterate(descent: Descent, evaluator: Evaluator, cfg: LeastSquaresCfg) -> None:
     """Look around if x has moved, try steps, take the best, and say when it is time to stop."""
     blind = descent.hessian is None
-    hessian, gradient, jacobian = descent.look(evaluator, colouring, where)
+    hessian, gradient, jacobian = descent.look(evaluator)
     descent.jacobian = None
     if not descent.scores:
         descent.stop_reason = "diverged at its start"
@@ -230,9 +221,9 @@ def _iterate(
     descent.scores.append(descent.score)
     step = Step(descent, hessian, gradient)
     left, allowed = step.expected, cfg.tolerance(descent.score) * descent.score
-    steps = 1 if jacobian is None else 1 + (len(colouring.colours) + 1 + NOISE_ROWS) // len(step.trials)
+    steps = 1 if jacobian is None else 1 + (len(evaluator.colouring.colours) + 1 + NOISE_ROWS) // len(step.trials)
     for _ in range(steps):
-        gain, residuals = step.take(evaluator, where)
+        gain, residuals = step.take(evaluator)
         if jacobian is None or gain < _AS_EXPECTED * step.expected or descent.score <= cfg.target_score:
             break
         step = Step(descent, hessian, jacobian.gradient_at(descent.x, residuals.error[0]), _FEW)
@@ -277,10 +268,10 @@ class Step:
         self.expected = model.expected_gain(self.trials[0] - descent.x)
         """What the first of them gains where J is right [rad²]."""
 
-    def take(self, evaluator: Evaluator, where: torch.Tensor | None = None) -> tuple[float, Residuals]:
+    def take(self, evaluator: Evaluator) -> tuple[float, Residuals]:
         """Simulate them and go to the best; returns what was gained [rad²] and the best's residuals, m = 1."""
         descent = self.descent
-        residuals = evaluator.residuals(evaluator.space.to_physical(self.trials), where)
+        residuals = evaluator.residuals(evaluator.space.to_physical(self.trials))
         descent.simulations += len(self.trials)
         scores = residuals.score
         best = int(scores.argmin())
@@ -297,7 +288,6 @@ def by_chords(
     """Steps with known derivatives, as long as they gain what these promise.
 
     Args:
-        x: Normalised, (size,).
         there: Residuals at x, and derivatives near it.
         tolerance: The part of the score that a step gains at least.
 

@@ -1,8 +1,7 @@
 """Box-constrained Levenberg–Marquardt: where dampings lead, which row is taken, and what the damping is next.
 
 A whole robot's fit (``least_squares``) is one problem, that of single joints (``pace_optim/joints/fits``) one for
-each. Both simulate the same rows: the favoured step, its neighbours for the derivatives there, then steps at larger
-dampings. Where the favoured step wins, the next derivatives are already known.
+each.
 """
 
 from __future__ import annotations
@@ -47,16 +46,6 @@ class LinearModel:
         return -float(2 * self.gradient @ move + move @ self.hessian @ move)
 
 
-def rows_of(trials: torch.Tensor, neighbours: torch.Tensor) -> torch.Tensor:
-    """What is simulated: the favoured trial, its neighbours, the other trials."""
-    return torch.cat([trials[:1], neighbours, trials[1:]])
-
-
-def trial_rows(rows: int, trials: int) -> list[int]:
-    """Which of the rows are trials, the favoured first."""
-    return [0, *range(rows - trials + 1, rows)]
-
-
 def next_damping(damping: float, best: int | None) -> float:
     """The damping after a step; ``best`` is the trial that was taken, ``None``: none was better."""
     return damping * _REFUSED if best is None else max(_SMALLEST_DAMPING, damping * DAMPING_TRIALS[best] / 10.0)
@@ -71,7 +60,6 @@ def bounded_step(x: torch.Tensor, hessian: torch.Tensor, gradient: torch.Tensor,
     Entries without influence stay.
 
     Args:
-        x: Present vector, (size,).
         hessian: JᵀJ, (size, size).
         gradient: Jᵀr, (size,).
 

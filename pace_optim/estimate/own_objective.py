@@ -1,18 +1,21 @@
-"""An objective of the user's own: the class that a fit names, and what it says of any candidates."""
+"""An objective of the user's own: the class that a fit names, what it says of any candidates, and error bars of it."""
 
 from __future__ import annotations
 
 import inspect
+import itertools
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import torch
 
 from pace_actuators.own_code import CodeRecord, import_named, import_recorded, loaded_module, split_reference
 from pace_optim.estimate.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
+from pace_optim.estimate.error_bars.uncertainty import AT_BOUND, Uncertainty, uncertainty_of
 from pace_optim.problem.evaluator import Evaluator, Residuals
 from pace_optim.problem.problem import Problem
 from pace_optim.problem.rollout import Rollout
@@ -105,10 +108,6 @@ class Objective:
     def errors(self, evaluator: Evaluator, physical: torch.Tensor, where: torch.Tensor) -> torch.Tensor:
         """The score of candidates, in parts in time; the sum over the parts is the score.
 
-        Args:
-            physical: Physical parameters, (m, size).
-            where: Which samples count, (T, R) bool.
-
         Returns:
             (m, parts).
         """
@@ -184,3 +183,104 @@ def optimizer_modules(optimizer: str) -> Sequence[str]:
     """The module of an optimizer of the user's own; none of ours."""
     module, _ = split_reference(optimizer)
     return [module] if module else []
+
+
+_STEP = 2e-3
+"""Of the first derivatives, normalised to bounds of -1 and 1: a thousandth of each range."""
+_RISE = 0.1
+"""By how much of itself the objective is to rise over a step."""
+_ROUNDS = 6
+"""Times that steps are made longer or shorter for that, at most."""
+_FIRST = 0.05
+"""Length of the longest first step, normalised."""
+_LEAST = 1e-9
+"""A direction with less than this of the largest part of the gradients counts as one with this."""
+_TOGETHER = 4
+"""Parts in time that are taken as one independent block."""
+
+
+def objective_error_bars(objective: Objective, evaluator: Evaluator, x: torch.Tensor) -> tuple[Uncertainty, float]:
+    """Error bars at the minimum of an objective, and its value there.
+
+    With S_b the part of the objective in the b-th part of the samples, g_b its gradient and H the second derivatives
+    of their sum, the covariance is that of an M-estimator,
+
+        C = H⁻¹ (Σ_b (g_b - ḡ)(g_b - ḡ)ᵀ) H⁻¹
+
+    which needs no residuals (Huber 1967). Parts in time, not samples, are taken as independent. Differences are taken
+    along directions that the objective hardly confounds, as far as it takes to see them: those that whiten Σ g_b g_bᵀ.
+
+    The noise of the sample at which a simulation starts is not in them: of a second of recording they are up to half
+    too small.
+
+    Args:
+        evaluator: Simulates what is trained on.
+    """
+    space, where = evaluator.space, evaluator.dataset.train
+
+    def parts(vectors: torch.Tensor) -> np.ndarray:
+        return objective.errors(evaluator, space.to_physical(vectors.clamp(-1, 1)), where).numpy()
+
+    entries = np.eye(space.size)[(space.upper > space.lower).numpy()]
+    centre = x.clamp(-1 + _STEP, 1 - _STEP)
+    here, up, down = _differences(parts, centre, _STEP * entries)
+    hessian = np.diag(((up + down - 2 * here).sum(axis=1) / _STEP**2).clip(0) @ entries)
+    inside = (entries @ (1 - x.abs().numpy())) > AT_BOUND
+    moving = entries[inside & (hessian.diagonal() @ entries.T > 0)]
+    spread = np.zeros_like(hessian)
+    if len(moving):
+        gradient = moving @ entries.T @ (up - down) / (2 * _STEP)
+        steps = _whitened(gradient) @ moving
+        for _ in range(_ROUNDS):
+            here, up, down = _differences(parts, x, steps)
+            rise = 0.5 * (up + down - 2 * here).sum(axis=1)
+            scale = np.sqrt(_RISE * here.sum() / rise.clip(1e-300)).clip(0.1, 10.0)
+            if ((scale > 0.5) & (scale < 2)).all():
+                break
+            steps = steps * np.minimum(scale, 1 / np.abs(steps).max(axis=1))[:, None]
+        pairs = list(itertools.combinations(range(len(steps)), 2))
+        corners = [x + torch.as_tensor(steps[i] + steps[j]) for i, j in pairs]
+        both = parts(torch.stack(corners)) if corners else np.zeros((0, up.shape[1]))
+        curvature = np.diag((up + down - 2 * here).sum(axis=1))
+        for (i, j), part in zip(pairs, both, strict=True):
+            curvature[i, j] = curvature[j, i] = (part - up[i] - up[j] + here).sum()
+        back = np.linalg.pinv(steps)  # entries from steps, and derivatives by entries from those along steps
+        seen = back @ _not_negative(curvature) @ back.T
+        at = moving.any(axis=0)
+        hessian[np.ix_(at, at)] = seen[np.ix_(at, at)]
+        slopes = _in_blocks(0.5 * (up - down))
+        around = slopes - slopes.mean(axis=1, keepdims=True)
+        spread = back @ around @ around.T @ back.T * (slopes.shape[1] / max(1, slopes.shape[1] - 1))
+    samples, most = int(where.sum()), float(hessian.diagonal().max())
+    scale = samples / (4 * most) if most > 0 else 1.0  # thresholds in radians are meant of what moves most
+    uncertainty = uncertainty_of(scale * hessian, scale**2 * spread, samples, evaluator.colouring, space, x)
+    return uncertainty, float(parts(x[None]).sum())
+
+
+def _differences(
+    parts: Callable[[torch.Tensor], np.ndarray], x: torch.Tensor, steps: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The objective's parts at x, (parts,), and after each step and its opposite, (k, parts) each."""
+    moved = torch.as_tensor(steps)
+    found = parts(torch.cat([x[None], x + moved, x - moved]))
+    return found[0], found[1 : 1 + len(steps)], found[1 + len(steps) :]
+
+
+def _whitened(gradient: np.ndarray) -> np.ndarray:
+    """Steps (k, k) along which gradients of parts (k, parts) do not go together, of a first guess of their lengths."""
+    size = np.sqrt(np.square(gradient).sum(axis=1)).clip(1e-300)
+    values, vectors = np.linalg.eigh(gradient @ gradient.T / np.outer(size, size))
+    steps = vectors.T / np.sqrt(values.clip(_LEAST * values.max()))[:, None] / size
+    return steps * (_FIRST / np.abs(steps).max())
+
+
+def _in_blocks(parts: np.ndarray) -> np.ndarray:
+    """Some neighbouring parts (k, parts) together."""
+    count = max(2, parts.shape[1] // _TOGETHER)
+    return np.stack([block.sum(axis=1) for block in np.array_split(parts, count, axis=1)], axis=1)
+
+
+def _not_negative(matrix: np.ndarray) -> np.ndarray:
+    """Without the negative eigenvalues of differences of a rough objective."""
+    values, vectors = np.linalg.eigh(matrix)
+    return (vectors * values.clip(1e-3 * values.max())) @ vectors.T

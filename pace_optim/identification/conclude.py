@@ -19,19 +19,15 @@ from pace_optim.estimate.error_bars.assessment import Assessment, assess, trajec
 from pace_optim.estimate.error_bars.consistency import Consistency, check_consistency
 from pace_optim.estimate.error_bars.far_from_noise import FAR_ABOVE_NOISE, far_end, times_noise
 from pace_optim.estimate.error_bars.loop_rate import LoopRates, loop_rates, used_loop
+from pace_optim.estimate.error_bars.physics_step import change_without_step, step_share
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty
-from pace_optim.estimate.error_bars.undetermined import (
-    DELAY,
-    change_without_step,
-    held_at_prior,
-    step_share,
-    undetermined,
-    without_delay,
-)
+from pace_optim.estimate.error_bars.undetermined import DELAY, held_at_prior, undetermined, without_delay
 from pace_optim.estimate.error_bars.warnings import by_effect, fit_warnings, rough_motion
 from pace_optim.estimate.least_squares import LeastSquaresCfg
+from pace_optim.estimate.own_objective import Objective, objective_error_bars, optimizer_class
+from pace_optim.estimate.way_down import WayDown
 from pace_optim.identification.optimization import NEAR, Optimization, Outcome
-from pace_optim.problem.evaluator import Evaluator, Residuals
+from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.problem import Problem
 from pace_optim.run.result import FitResult, make_result, rmse_by_joint
 from pace_optim.run.summary import error_line
@@ -46,14 +42,10 @@ CHECKS_INTERRUPTED = "checks interrupted"
 class _End:
     """The vector that is kept, and what is known of it."""
 
-    problem: Problem
-    """What was fitted; with the rate of the drives' loops where the recordings show it."""
+    way: WayDown
+    """With the problem that was fitted: at the rate of the drives' loops where the recordings show it."""
     at: Assessment
     """The vector, and what noise alone leaves open."""
-    train_rmse: float
-    """Where the optimizers ended [rad]."""
-    times: float | None
-    """The same as a multiple of the noise."""
     stop_reasons: tuple[str, ...]
     left_open: list[str] = field(default_factory=list)
     """Labels of what the recordings leave open: it is at its prior."""
@@ -64,6 +56,11 @@ class _End:
     consistency: Consistency = field(default_factory=Consistency)
 
     @property
+    def problem(self) -> Problem:
+        """What was fitted."""
+        return self.way.problem
+
+    @property
     def x(self) -> torch.Tensor:
         """The vector, normalised (size,)."""
         return self.at.x
@@ -72,6 +69,16 @@ class _End:
     def jacobian(self) -> Jacobian:
         """On the training samples of the recordings that are trained on."""
         return self.at.jacobian
+
+    @cached_property
+    def rmse(self) -> dict[str, dict[str, float]]:
+        """Errors of training and validation by joint [rad]."""
+        return _rmse(self.problem, self.at.residuals)
+
+    @cached_property
+    def times(self) -> float | None:
+        """That of training as a multiple of the noise."""
+        return times_noise(self.problem, self.rmse["train"][ALL])
 
     @property
     def is_far(self) -> bool:
@@ -93,12 +100,9 @@ class _End:
             result = result.with_step(np.where(self.known, share, np.nan))
         return result
 
-    def moved(self, run: Optimization, x: torch.Tensor, held: Sequence[str] = ()) -> _End:
+    def moved(self, x: torch.Tensor, held: Sequence[str] = ()) -> _End:
         """Another vector nearby, with some parameters held."""
-        problem = self.problem
-        at = self.at.moved(problem, *_evaluators(run, problem), x, held)
-        train = _train_rmse(problem, at.residuals)
-        return replace(self, at=at, train_rmse=train, times=times_noise(problem, train))
+        return replace(self, at=self.at.moved(self.way.assessor, self.way.evaluator, x, held))
 
 
 def conclude(
@@ -126,9 +130,7 @@ def conclude(
         if not keep_interrupted:
             raise
         end = replace(end, stop_reasons=(*end.stop_reasons, CHECKS_INTERRUPTED))
-    space = end.problem.space
-    bias = space.to_physical(end.x)[space["encoder_bias"]].numpy()
-    run.folder.write_json("drives.json", drive_loads(end.problem, _evaluators(run, end.problem)[0], bias))
+    _write_drives(run, end.way, end.x)
     return _write(run, record, end, checked=True)
 
 
@@ -140,11 +142,33 @@ def _write(run: Optimization, record: EnvironmentRecord, end: _End, checked: boo
     return result
 
 
+def _write_drives(run: Optimization, way: WayDown, x: torch.Tensor) -> None:
+    space = way.problem.space
+    bias = space.to_physical(x)[space["encoder_bias"]].numpy()
+    run.folder.write_json("drives.json", drive_loads(way.problem, way.assessor, bias))
+
+
+def _of_run(run: Optimization, record: EnvironmentRecord) -> dict[str, Any]:
+    """What a result says of its run."""
+    return {
+        "effects": run.problem.effects,
+        "environment": record.to_dict(),
+        "optimizer": run.settings.optimizer,
+        "seed": run.settings.seed,
+        "generations": run.optimizer.generation if run.optimizer else 0,
+        "wall_time_s": run.progress.elapsed,
+    }
+
+
+def _rmse(problem: Problem, every: Residuals) -> dict[str, dict[str, float]]:
+    """Errors of training and validation by joint, from the residuals on all samples [rad]."""
+    where = {"train": problem.dataset.train[every.step], "validation": problem.dataset.validation[every.step]}
+    return {name: rmse_by_joint(every, mask, problem.joint_names) for name, mask in where.items()}
+
+
 def _result(run: Optimization, record: EnvironmentRecord, end: _End, checked: bool = True) -> FitResult:
     """What is known so far, as a run keeps it."""
-    problem, data, settings, every = end.problem, end.problem.dataset, run.settings, end.at.residuals
-    where = {"train": data.train[every.step], "validation": data.validation[every.step]}
-    rmse = {name: rmse_by_joint(every, mask, problem.joint_names) for name, mask in where.items()}
+    problem, every = end.problem, end.at.residuals
     uncertainty = end.uncertainty
     physical = problem.space.to_physical(end.x)
     open_ = set(undetermined(problem, end.x, end.uncertainty, end.is_far)) - set(uncertainty.no_influence)
@@ -157,25 +181,20 @@ def _result(run: Optimization, record: EnvironmentRecord, end: _End, checked: bo
         end.x,
         every,
         uncertainty,
-        effects=problem.effects,
-        environment=record.to_dict(),
-        optimizer=settings.optimizer,
-        seed=settings.seed,
-        generations=run.optimizer.generation if run.optimizer else 0,
+        **_of_run(run, record),
         simulated_steps=run.steps + end.consistency.simulated_steps,
-        wall_time_s=run.progress.elapsed,
         stop_reasons=[stalled if end.is_far and reason == "converged" else reason for reason in end.stop_reasons],
         undetermined=end.left_open,
         times_noise=end.times,
         std_means_nothing=end.is_far,
-        assumes_loop_rate=run.problem.assumes_loop_rate,
+        assumes_loop_rate=problem.assumes_loop_rate,
         loop_rate=_loop_rate(end.problem, rates),
         warnings=by_effect(
             [
-                *far_end(end.times, end.train_rmse, settings.optimizer, problem.joint_types),
+                *far_end(end.times, end.rmse["train"][ALL], run.settings.optimizer, problem.joint_types),
                 *rough_motion(end.at.noise, float(end.jacobian.residuals.score[0])),
                 *([] if rates is None else rates.sentences(problem.space, end.known)),
-                *(fit_warnings(problem, physical, told, rmse, end.left_open, unsure) if checked else []),
+                *(fit_warnings(problem, physical, told, end.rmse, end.left_open, unsure) if checked else []),
                 *end.consistency.sentences,
             ]
         ),
@@ -192,29 +211,10 @@ def _loop_rate(problem: Problem, rates: LoopRates | None) -> dict[str, Any]:
 
 def _reached(run: Optimization, outcome: Outcome) -> _End:
     """Where the optimizers ended, with error bars."""
-    problem = run.problem
-    every, training = _evaluators(run, problem)
-    at = assess(problem, every, run.colouring, outcome.x, run.ended, training)
+    way, problem = run.way, run.problem
+    at = assess(problem, way.assessor, outcome.x, run.ended, way.evaluator)
     run.refuse_divergence(float(at.jacobian.residuals.score[0]))
-    train = _train_rmse(problem, at.residuals)
-    return _End(
-        problem=problem,
-        at=at,
-        train_rmse=train,
-        times=times_noise(problem, train),
-        stop_reasons=tuple(outcome.stop_reasons),
-    )
-
-
-def _train_rmse(problem: Problem, every: Residuals) -> float:
-    return rmse_by_joint(every, problem.dataset.train[every.step], problem.joint_names)[ALL]
-
-
-def _evaluators(run: Optimization, problem: Problem) -> tuple[Evaluator, Evaluator]:
-    """What simulates all recordings, and what simulates those that are trained on."""
-    if problem is run.problem:
-        return run.assessor, run.evaluator
-    return problem.evaluator(), problem.training_evaluator()
+    return _End(way=way, at=at, stop_reasons=tuple(outcome.stop_reasons))
 
 
 def _with_loop_rate(run: Optimization, end: _End) -> _End:
@@ -228,7 +228,7 @@ def _with_loop_rate(run: Optimization, end: _End) -> _End:
     if rates.chosen == rates.fitted:
         return end
     x = end.problem.space.to_normalised(torch.from_numpy(rates.value_at(rates.chosen)))
-    return replace(_reached(run, run.with_loop(end.problem, rates.chosen, x)), rates=rates)
+    return replace(_reached(run, run.with_loop(rates.chosen, x)), rates=rates)
 
 
 def _with_step(run: Optimization, end: _End) -> _End:
@@ -237,7 +237,7 @@ def _with_step(run: Optimization, end: _End) -> _End:
         run.progress.say("simulating with a finer step, to measure the part of the step")
         there = end.jacobian.residuals
         change = change_without_step(end.problem, end.problem.space.to_physical(end.x), there, end.at.phases)
-        outcome = None if end.is_far else run.at_half_the_step(end.problem, end.x, there, change)
+        outcome = None if end.is_far else run.at_half_the_step(end.x, there, change)
         if outcome is None:
             return replace(end, without_step=change)
         end = replace(_reached(run, outcome), rates=end.rates)
@@ -260,13 +260,13 @@ def _at_prior(run: Optimization, end: _End, cfg: LeastSquaresCfg | None) -> _End
     count = plural(len(left_open), "value")
     run.progress.say(f"fitting again with what the recordings do not determine at its prior: {count}")
     x, left_open = held_at_prior(end.problem, end.x, end.uncertainty, left_open, cfg)
-    return replace(end.moved(run, x, left_open), left_open=left_open)
+    return replace(end.moved(x, left_open), left_open=left_open)
 
 
 def _perhaps_without_delay(run: Optimization, end: _End) -> _End:
     """Set an insignificant delay to zero."""
     x = without_delay(end.problem, end.x, end.uncertainty, end.left_open, NEAR)
-    return end if x is None else end.moved(run, x, [*end.left_open, DELAY])
+    return end if x is None else end.moved(x, [*end.left_open, DELAY])
 
 
 def _consistent(run: Optimization, end: _End) -> _End:
@@ -286,3 +286,48 @@ _CHECKS = (_with_loop_rate, _with_step, _with_prior, _perhaps_without_delay, _co
 """What is checked of a result, in this order."""
 _WHERE_FAR = (_silent_at_prior, _with_prior)
 """The same far above the noise: where physics is missing, recordings disagree, and that is the diagnosis' work."""
+
+
+def conclude_own(run: Optimization, record: EnvironmentRecord, outcome: Outcome) -> FitResult:
+    """Evaluate the user's own objective at its best candidate, with its error bars, and write it down.
+
+    Positions are simulated and compared too: the errors of ``rmse`` are theirs. Nothing is refined, held at a prior or
+    fitted again, since least squares minimise another objective.
+    """
+    way, problem, x = run.way, run.problem, outcome.x
+    run.progress.say("error bars of the objective")
+    objective = Objective(optimizer_class(run.settings.optimizer), problem)
+    physical, validation = problem.space.to_physical(x), problem.dataset.validation
+    every = objective.residuals(way.assessor, physical)
+    run.refuse_divergence(float(every.score[0]))
+    uncertainty, score = objective_error_bars(objective, way.evaluator, x)
+    held_out = float(objective.errors(way.assessor, physical[None], validation).sum()) if validation.any() else None
+    run.folder.write_tensors("best_trajectory.pt", trajectories(problem, every))
+    _write_drives(run, way, x)
+    rmse = _rmse(problem, every)
+    times = times_noise(problem, rmse["train"][ALL])
+    unsure = [label for label in undetermined(problem, x, uncertainty) if label not in uncertainty.no_influence]
+    result = make_result(
+        problem,
+        x,
+        every,
+        uncertainty,
+        **_of_run(run, record),
+        objective={"train": score, "validation": held_out},
+        simulated_steps=run.steps,
+        stop_reasons=outcome.stop_reasons,
+        times_noise=times,
+        warnings=by_effect([*_other_objective(times), *fit_warnings(problem, physical, uncertainty, rmse, (), unsure)]),
+    )
+    result.save(run.folder.path / "result.json")
+    return result
+
+
+def _other_objective(times: float | None) -> list[str]:
+    """A warning where the positions are far above the noise."""
+    if times is None or times < FAR_ABOVE_NOISE:
+        return []
+    return [
+        f"The positions of this minimum are {times:,.0f} times the measurement noise away from the recording: the "
+        "objective differs from the position error. Compare with a fit without --optimizer. [W19]"
+    ]

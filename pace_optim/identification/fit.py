@@ -13,9 +13,8 @@ from pace_actuators.text import listed
 from pace_envs.task_source import EnvironmentRecord
 from pace_optim.estimate.own_objective import optimizer_modules, use_recorded_optimizer
 from pace_optim.estimate.search import agree_to_stop, search
-from pace_optim.identification.conclude import conclude
-from pace_optim.identification.optimization import Optimization, with_structures
-from pace_optim.identification.own_objective import conclude_own
+from pace_optim.identification.conclude import conclude, conclude_own
+from pace_optim.identification.optimization import INTERRUPTED, Optimization, with_structures
 from pace_optim.identification.setup import load_for_fit, make_optimizer, make_searcher
 from pace_optim.problem.recordings import tell_nobody, tell_on_stderr
 from pace_optim.recording.torque import NoTorqueError
@@ -37,7 +36,6 @@ from pace_optim.terminal.processes import Processes
 from pace_optim.terminal.progress import ProgressLine
 
 _NOTE = "note: "
-_INTERRUPTED = "interrupted"
 _NOISY = 1.5
 """Times the noise above which a fit leaves something that torques may explain."""
 _BETTER = 0.9
@@ -59,7 +57,6 @@ def fit(
 
     Args:
         settings: What to fit, and how; its task and effects are known (:func:`pace_envs.task_source.use_task`).
-        progress: Shows how far it is.
         before: The run whose robot is fitted anew, if there is one.
         on_start: Gets the run's folder before the first simulation.
         assess_interrupted: Whether an interrupted fit still assesses and writes the best so far; otherwise the
@@ -122,7 +119,7 @@ def _by_torques(
     """A fit of positions, or the better one by its torques."""
     several = processes is not None and processes.count > 1
     depends = bool(first.contested or first.from_torques)
-    if several or not depends or _INTERRUPTED in first.stop_reasons or (first.times_noise or 0.0) < _NOISY:
+    if several or not depends or INTERRUPTED in first.stop_reasons or (first.times_noise or 0.0) < _NOISY:
         return first, folder
     for facts, other in _attempts(first, folder, settings):
         progress.tell(f"The fit is at {first.times_noise:.3g} times the noise: fitting with {facts}.")
@@ -130,7 +127,7 @@ def _by_torques(
             result, path = fit(other, progress, tell=tell_nobody)
         except NoTorqueError:
             continue
-        if _INTERRUPTED in result.stop_reasons:
+        if INTERRUPTED in result.stop_reasons:
             progress.tell(f"The fit with {facts} was broken off: {command('fit')} --resume {shlex.quote(str(path))}.")
             return first, folder
         if _is_better(result, first, facts, progress):
@@ -177,7 +174,6 @@ def resume(
 
     Args:
         max_iteration: Another largest number of generations.
-        progress: Shows how far it is.
         task: Where the run's environment is found now, if it has been moved.
         device: Where the search simulates; ``None``: as before.
         processes: As for :func:`fit`.
@@ -189,7 +185,7 @@ def resume(
     folder = RunFolder(Path(path))
     checkpoint = folder.read_checkpoint()
     read_bounds(folder.path)
-    ended = (folder.path / "result.json").exists() and _INTERRUPTED not in FitResult.load(folder.path).stop_reasons
+    ended = (folder.path / "result.json").exists() and INTERRUPTED not in FitResult.load(folder.path).stop_reasons
     if (folder.path / "result.json").exists():  # its report is made of more
         check_folder(folder.path)
     before = _reopened(folder.path, settings, task)
@@ -202,7 +198,7 @@ def resume(
     run = Optimization(settings, problem, folder, progress or ProgressLine(), processes)
     run.restore(checkpoint)
     result, path = _finished(run, before.record)
-    if ended or _INTERRUPTED in result.stop_reasons:
+    if ended or INTERRUPTED in result.stop_reasons:
         return result, path
     if settings.instead_of is None:
         return _by_torques(result, path, settings, run.progress, processes)
@@ -227,7 +223,7 @@ def help_fit(processes: Processes, device: str, path: str | None = None, task: s
     problem = problem if loop in (None, problem.loop_dt) else problem.with_loop(loop)
     if len(around):
         problem = with_structures(problem, None, around)
-    searcher = make_searcher(problem.for_search(device), settings)
+    searcher = make_searcher(problem, settings)
     optimizer = make_optimizer(problem, settings, processes, around if len(around) else None)
     optimizer.restore(history, line_generation)
     search(optimizer, searcher.rollout(optimizer.num_shown), lambda _: agree_to_stop(optimizer, processes))

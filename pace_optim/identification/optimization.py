@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,14 +13,13 @@ from pace_actuators.effects import effect_cfgs
 from pace_actuators.joint_units import units_for
 from pace_optim.estimate.cmaes_optimizer import CMAESOptimizer
 from pace_optim.estimate.comb_scan import scanned
-from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
 from pace_optim.estimate.error_bars.loop_rate import UNEXPLAINED
 from pace_optim.estimate.error_bars.uncertainty import torque_noise
 from pace_optim.estimate.error_bars.undetermined import at_prior
 from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg
 from pace_optim.estimate.search import agree_to_stop, search
-from pace_optim.estimate.way_down import PIECES, WHOLE, WayDown, WayDownCfg
+from pace_optim.estimate.way_down import PIECES, WHOLE, WayDown
 from pace_optim.identification.balanced_start import balanced_start
 from pace_optim.identification.setup import make_optimizer, make_searcher
 from pace_optim.problem.evaluator import Evaluator, Residuals
@@ -35,17 +33,10 @@ from pace_optim.terminal.progress import ProgressLine
 
 NEAR = LeastSquaresCfg(score_tolerance=0.02)
 """For a vector that is known to be near the best."""
-_INTERRUPTED = "interrupted"
+INTERRUPTED = "interrupted"
 _LOOPS = (1e-3, 0.0)
 """Periods of drives' loops that are tried where theirs is not stated: the usual one of servo drives, and none [s]. A
 delayed torque needs a loop that holds it."""
-STRUCTURE, MIXED, FOUND = "structure {:g}, ", "structure of each joint, ", "found structure, "
-"""What the stages' names begin with, with another structure of effects: of all joints, of each joint, and the best."""
-OTHER_LOOP, FINER_STEP, FURTHER, TORQUE_NOISE, POSITIONS, WEIGHED = (
-    "loop of {:g} s, ", "step of {:g} s, ", "further {}, ", "torque noise {}, ", "positions, ", "torque noise, ",
-)  # fmt: skip
-"""The same with another loop, at a finer step, where pieces had not ended, by the noise that torques have, without
-torques, and by that noise from a vector that is known."""
 _TORQUE_ATTEMPTS = 3
 """Times that the noise of torques is set."""
 _BY_CHANCE = 2.0
@@ -76,19 +67,7 @@ class Outcome:
     @property
     def is_interrupted(self) -> bool:
         """Whether that is only the best so far."""
-        return self.stop_reasons == [_INTERRUPTED]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Course:
-    """A problem and the way down with it."""
-
-    problem: Problem
-    evaluator: Evaluator
-    """On the recordings that are trained on."""
-    assessor: Evaluator
-    """On all recordings."""
-    way: WayDown
+        return self.stop_reasons == [INTERRUPTED]
 
 
 class Optimization:
@@ -105,122 +84,110 @@ class Optimization:
         """Prepare evaluators and optimizers; nothing is simulated yet.
 
         Args:
-            progress: Shows how far it is.
             processes: Who shares the search's candidates.
         """
         self.settings = settings
         if not settings.only_searches:
             problem = with_structures(problem, settings.start)
-        self.problem = problem
         self.folder = folder
         self.progress = progress
         self.history = History()
         self._restored: list[Descent] = []
-        self.searcher = make_searcher(problem.for_search(settings.device), settings)
+        self.searcher = make_searcher(problem, settings)
         self.processes = processes or Processes()
-        self.colouring = colour(problem.space, problem.trees, problem.joint_names)
         self.optimizer = make_optimizer(problem, settings, self.processes) if settings.only_searches else None
         self._around = torch.zeros(0, dtype=torch.float64)
         """Physical parameters around which a hybrid searches, (size,); empty before."""
-        self._courses: list[_Course] = []
+        self.ways: list[WayDown] = []
+        """That of the problem as it was stated, then those of others."""
+        self.way = self._way(problem)
+        """The one whose end is the fit's."""
         self._halvings = 0
-        self._use(self._course(problem))
         self._steps_before = self._looks = self._looks_before = 0
         self._search_stop: list[str] = []
         self._searched = False
         self._saved: dict[str, list] = {"params": [], "scores": []}
         self.log = TensorBoardLog(folder.path)
 
-    def _course(self, problem: Problem, name: str = "") -> _Course:
-        """A way down with this problem, as far as an interrupted run had gone it."""
-        evaluator, pieces = problem.training_evaluator(), problem.on_pieces(WayDownCfg().share)
-        way = WayDown(
-            evaluator,
-            self.colouring,
-            pieces=pieces.training_evaluator(),
-            noise_score=noise_score(problem),
-            on_iteration=self._after_iteration,
-            name=name,
-        )
+    def _way(self, problem: Problem, name: str = "") -> WayDown:
+        """The way down with a problem, as far as an interrupted run had gone it."""
+        way = WayDown(problem, on_iteration=self._after_iteration, name=name)
         way.descents = [d for d in self._restored if d.stage in way.stages]
-        course = _Course(problem=problem, evaluator=evaluator, assessor=problem.evaluator(), way=way)
-        self._courses.append(course)
-        return course
+        self.ways.append(way)
+        return way
 
-    def _use(self, course: _Course) -> None:
-        """Take a course's end for the fit's."""
-        self.problem, self.evaluator, self.assessor = course.problem, course.evaluator, course.assessor
-        self._in_use = course
+    def _search_on(self, way: WayDown) -> None:
+        """Take a way's end for the fit's, and search with its problem."""
+        self.way = way
+        self.searcher = make_searcher(self.problem, self.settings)
+
+    def _ended(self, way: WayDown, end: Descent) -> Outcome:
+        """The end of a way, which is the fit's."""
+        self.way = way
+        return Outcome(x=end.x, stop_reasons=[end.stop_reason])
+
+    @property
+    def problem(self) -> Problem:
+        """What is fitted."""
+        return self.way.problem
 
     @property
     def ended(self) -> Descent | None:
-        """The last descent of the course whose end is the fit's; ``None`` before it."""
-        return next(reversed(self._in_use.way.descents), None)
-
-    @property
-    def way(self) -> WayDown:
-        """The way of the problem as it was stated."""
-        return self._courses[0].way
+        """The last descent of the way whose end is the fit's; ``None`` before it."""
+        return next(reversed(self.way.descents), None)
 
     @property
     def descents(self) -> list[Descent]:
         """All descents so far, in the order in which they began."""
-        return [descent for course in self._courses for descent in course.way.descents]
+        return [descent for way in self.ways for descent in way.descents]
 
     @property
     def steps(self) -> int:
         """Simulated steps, with those before a resume."""
-        used = (e for c in self._courses for e in (c.evaluator, c.assessor, c.way.pieces))
-        every = {self.searcher, *used}
-        return self._steps_before + sum(evaluator.simulated_steps for evaluator in every)
+        used = {self.searcher, *(e for way in self.ways for e in (way.evaluator, way.assessor, way.pieces))}
+        return self._steps_before + sum(evaluator.simulated_steps for evaluator in used)
 
-    def _elsewhere(self, best: Descent) -> WayDown | None:
-        """The way of other facts, begun at the best end on pieces: another loop rate, the noise that torques have."""
-        way = self._with_structure(best)
-        if way is not None:
-            best = min(way.descents, key=lambda d: d.score)
-        way = self._with_other_loop(best) or way
+    def _go_elsewhere(self, best: Descent) -> None:
+        """Take the way of other facts, begun at the best end on pieces: structures, loop rates, the torques' noise."""
+        best = self._with_structure(best)
+        best = self._with_other_loop(best)
         if self.problem.dataset.torques is None:
-            return way
-        if way is not None:
-            best = min(way.descents, key=lambda d: d.score)
+            return
         for attempt in range(_TORQUE_ATTEMPTS):  # what is left before a descent has ended is no noise
             if best.stop_reason == "converged":
                 break
-            best = self._course(self.problem, FURTHER.format(attempt)).way.begin([best.x])
-        self._use(self._by_torque_noise(best.x))
-        return self._in_use.way
+            best = self._way(self.problem, f"further {attempt}").begin([best.x])
+        self.way = self._by_torque_noise(best.x)
 
-    def _by_torque_noise(self, x: torch.Tensor) -> _Course:
-        """The course on which torques weigh by what they leave on pieces, begun at a normalised vector (size,).
+    def _by_torque_noise(self, x: torch.Tensor) -> WayDown:
+        """The way on which torques weigh by what they leave on pieces, begun at a normalised vector (size,).
 
         Their noise grows where positions are then followed worse than without them, by more than noise explains: a
         filter's errors look like errors of the drive. A change of parameters is as the square of a torque's weight, and
         χ² of the positions as the square of that.
         """
-        noise = self._torque_noise(self._in_use.way.pieces, x)
+        noise = self._torque_noise(self.way.pieces, x)
         while (found := self._at_finer_step(x, noise)) is not None:
             x, noise = found
         problem, size = self.problem, int(self.problem.space.moves.sum())
         alone: torch.Tensor | None = None
         for attempt in range(1, _TORQUE_ATTEMPTS + 1):
-            course = self._course(problem.with_torque_noise(noise), TORQUE_NOISE.format(attempt))
-            end = course.way.begin([x])
+            way = self._way(problem.with_torque_noise(noise), f"torque noise {attempt}")
+            end = way.begin([x])
             if alone is None:
-                without = self._course(problem.with_torque_noise(dict.fromkeys(noise, np.inf)), POSITIONS)
-                alone = without.way.begin([end.x]).x
-            with self._found_again(course.way.pieces):
-                both = course.way.pieces.residuals(problem.space.to_physical(torch.stack([end.x, alone]))).positions
+                without = self._way(problem.with_torque_noise(dict.fromkeys(noise, np.inf)), "positions")
+                alone = without.begin([end.x]).x
+            both = self._look(way.pieces, torch.stack([end.x, alone])).positions
             (followed, best), count = both.joint_score, int(problem.dataset.train.sum())
             chi2 = count * (followed / best - 1) / (_BY_CHANCE * size / len(noise))
             if not bool((chi2 > 1).any()):
                 break
             noise = {
-                joint: course.problem.torque_noise.get(joint, 0.0) * more
+                joint: way.problem.torque_noise.get(joint, 0.0) * more
                 for joint, more in zip(noise, chi2.clamp(min=1.0).pow(0.25).tolist(), strict=True)
             }
             x = alone
-        return course
+        return way
 
     def _at_finer_step(
         self, x: torch.Tensor, noise: Mapping[str, float]
@@ -231,130 +198,136 @@ class Optimization:
         """
         floor = self.problem.torque_floor
         above = [joint for joint, value in noise.items() if value > _STEP_IN_DOUBT * floor.get(joint, np.inf)]
-        if not above or self.settings.physics_dt is not None or self._halvings == _HALVINGS:
+        if not above or not self._may_halve:
             return None
-        problem = self.problem.with_physics_dt(self.problem.physics_dt / 2)
-        finer = self._course(problem, FINER_STEP.format(problem.physics_dt))
-        end = finer.way.begin([x])
-        left = self._torque_noise(finer.way.pieces, end.x)
+        finer = self._way_at_half_the_step()
+        end = finer.begin([x])
+        left = self._torque_noise(finer.pieces, end.x)
         if not any(left[joint] < _OF_TORQUES * noise[joint] for joint in above):
             return None
         self._halvings += 1
-        self.progress.say(f"the physics step shows in torques: going on with one of {1e3 * problem.physics_dt:g} ms")
-        self._use(finer)
+        self.progress.say(f"the physics step shows in torques: going on with one of {_ms(finer)}")
+        self.way = finer
         return end.x, left
+
+    @property
+    def _may_halve(self) -> bool:
+        """Whether the physics step may be halved once more."""
+        return self.settings.physics_dt is None and self._halvings < _HALVINGS
+
+    def _way_at_half_the_step(self) -> WayDown:
+        finer = self.problem.with_physics_dt(self.problem.physics_dt / 2)
+        return self._way(finer, f"step of {finer.physics_dt:g} s")
 
     def _torque_noise(self, evaluator: Evaluator, x: torch.Tensor) -> dict[str, float]:
         """What torques leave at a normalised vector (size,), by joint [N m]."""
-        with self._found_again(evaluator):
-            residuals = evaluator.residuals(self.problem.space.to_physical(x)[None])
         torques = evaluator.dataset.torques
+        residuals = self._look(evaluator, x[None])
         values = [] if torques is None else torque_noise(residuals, torques)
         return dict(zip(self.problem.joint_names, values, strict=False))
 
-    def _found_again(self, evaluator: Evaluator) -> AbstractContextManager[None]:
-        """A look between descents: of those before an interruption, the steps were counted before."""
-        self._looks += 1
-        return evaluator.again() if self._looks <= self._looks_before else nullcontext()
+    def _look(self, evaluator: Evaluator, x: torch.Tensor) -> Residuals:
+        """Residuals of normalised vectors (m, size) between descents.
 
-    def _with_structure(self, best: Descent) -> WayDown | None:
-        """The way with another structure of effects, begun at their probes, if it leads further on pieces.
+        A run that is resumed looks again; the steps of looks before the interruption were counted before.
+        """
+        before, self._looks = evaluator.simulated_steps, self._looks + 1
+        residuals = evaluator.residuals(evaluator.space.to_physical(x))
+        if self._looks <= self._looks_before:
+            self._steps_before -= evaluator.simulated_steps - before
+        return residuals
+
+    def _with_structure(self, best: Descent) -> Descent:
+        """Take the way with another structure of effects, begun at their probes, if it leads further on pieces.
 
         All joints take each structure in turn, then each joint the one with which it ended best.
+
+        Returns:
+            The best end on the way that is taken.
         """
         structures, noise = self.problem.structures, noise_score(self.problem)
         if not structures or best.score <= _IN_DOUBT**2 * noise:
-            return None
+            return best
         bases = [self.problem.space.to_physical(x) for x in (best.x, self.problem.space.start)]
-        tried = [(self._in_use, best)]
+        tried = [(self.way, best)]
 
-        def go(values: Mapping[str, float], starts: Sequence[torch.Tensor], name: str) -> None:
-            course = self._course(self.problem.holding(values), name)
-            tried.append((course, course.way.begin([course.problem.space.to_normalised(each) for each in starts])))
+        def go(held: Mapping[str, float], starts: Sequence[torch.Tensor], name: str) -> None:
+            way = self._way(self.problem.holding(held), name)
+            tried.append((way, way.begin([way.problem.space.to_normalised(each) for each in starts])))
 
         for value in sorted({each for values in structures.values() for each in values}):
             self.progress.say(f"above the noise: fitting {', '.join(structures)} at {value:g}")
             values = {label: value if value in own else own[0] for label, own in structures.items()}
             starts = [start for base in bases for start in self.problem.at_probes(base, value)]
-            go(values, starts, STRUCTURE.format(value))
-        scores, names = [self._joint_scores(*each) for each in tried], self.problem.joint_names
-        ends = [course.problem.space.to_physical(end.x) for course, end in tried]
+            go(values, starts, f"structure {value:g}")
+        # what each joint has left on pieces, (n,) [rad²]
+        scores = [self._look(way.pieces, end.x[None]).joint_score[0] for way, end in tried]
+        ends = [way.problem.space.to_physical(end.x) for way, end in tried]
+        names = self.problem.joint_names
         mixed, places = ends[0].clone(), self.problem.space.owners([[name] for name in names])
         for entry, j in enumerate(places):
             left = [float(own.sum() if j is None else own[j]) for own in scores]
             mixed[entry] = ends[left.index(min(left))][entry]
         if not any(torch.equal(mixed, end) for end in ends):
-            go({label: float(mixed[self.problem.space.labels.index(label)]) for label in structures}, [mixed], MIXED)
-        course, end = min(tried, key=lambda each: each[1].score)
-        if course is tried[0][0] or best.score - end.score <= UNEXPLAINED * (best.score - noise):
-            return None
-        found = self._course(course.problem, FOUND)  # a way that goes on has one start
-        found.way.begin([end.x])
-        self._use(found)
-        self.searcher = make_searcher(self.problem.for_search(self.settings.device), self.settings)
-        return found.way
+            values = {label: float(mixed[self.problem.space.labels.index(label)]) for label in structures}
+            go(values, [mixed], "structure of each joint")
+        way, end = min(tried, key=lambda each: each[1].score)
+        if way is self.way or best.score - end.score <= UNEXPLAINED * (best.score - noise):
+            return best
+        found = self._way(way.problem, "found structure")  # a way that goes on has one start
+        self._search_on(found)
+        return found.begin([end.x])
 
-    def _joint_scores(self, course: _Course, end: Descent) -> torch.Tensor:
-        """What each joint has left on pieces, (n,) [rad²]."""
-        with self._found_again(course.way.pieces):
-            return course.way.pieces.residuals(course.problem.space.to_physical(end.x)[None]).joint_score[0]
+    def _with_other_loop(self, best: Descent) -> Descent:
+        """Take the way of loops at another rate, begun at the best end on pieces, where that refutes the assumed rate.
 
-    def _with_other_loop(self, best: Descent) -> WayDown | None:
-        """The way of loops at another rate, begun at the best end on pieces, where that refutes the assumed rate."""
+        Returns:
+            The best end on the way that is taken.
+        """
         problem, noise = self.problem, noise_score(self.problem)
         if not problem.assumes_loop_rate:
-            return None
+            return best
         found, least = None, best
         for period in _LOOPS if problem.delay_mode == "command" else _LOOPS[:1]:
             if period == problem.loop_dt or least.score <= _IN_DOUBT**2 * noise:
                 continue
             rate = f"at {1e-3 / period:g} kHz" if period else "continuously"
             self.progress.say(f"error above the noise: fitting drive loops that run {rate}, as none is stated")
-            other = self._course(problem.with_loop(period), OTHER_LOOP.format(period))
-            end = other.way.begin([least.x])
+            other = self._way(problem.with_loop(period), f"loop of {period:g} s")
+            end = other.begin([least.x])
             if end.score < least.score:
                 found, least = other, end
         if found is None or best.score - least.score <= UNEXPLAINED * (least.score - noise):
-            return None
-        self._use(found)
-        self.searcher = make_searcher(self.problem.for_search(self.settings.device), self.settings)
-        return found.way
+            return best
+        self._search_on(found)
+        return least
 
-    def with_loop(self, problem: Problem, period: float, x: torch.Tensor) -> Outcome:
+    def with_loop(self, period: float, x: torch.Tensor) -> Outcome:
         """Go on with loops of another period [s], near where a fit of pieces with it ends, normalised (size,)."""
-        other = self._course(problem.with_loop(period), OTHER_LOOP.format(period))
-        end = other.way.near(x, NEAR)
-        self._use(other)
-        return Outcome(x=end.x, stop_reasons=[end.stop_reason])
+        other = self._way(self.problem.with_loop(period), f"loop of {period:g} s")
+        return self._ended(other, other.near(x, NEAR))
 
-    def at_half_the_step(
-        self, problem: Problem, x: torch.Tensor, there: Residuals, change: torch.Tensor | None
-    ) -> Outcome | None:
+    def at_half_the_step(self, x: torch.Tensor, there: Residuals, change: torch.Tensor | None) -> Outcome | None:
         """Go on from the end of a fit at half its physics step, where that shows.
 
         Args:
-            x: That end, normalised (size,).
             there: Its residuals (m = 1).
             change: How they would change without a step, (K, R, n) [rad]; ``None``: that is not known.
 
         Returns:
             The end at the finer step; its problem is the run's from now on. ``None`` where it is no better.
         """
-        noise, score = noise_score(problem), float(there.score[0])
-        if change is None or self.settings.physics_dt is not None or self._halvings == _HALVINGS:
+        noise, score = noise_score(self.problem), float(there.score[0])
+        if change is None or not self._may_halve:
             return None
         of_step = float(change.square().sum() / there.where.sum())
         if score <= _STEP_IN_DOUBT**2 * noise or of_step <= _OF_THE_STEP * (score - noise):
             return None
         self._halvings += 1
-        problem = problem.with_physics_dt(problem.physics_dt / 2)
-        self.progress.say(f"the physics step shows: going on with one of {1e3 * problem.physics_dt:g} ms")
-        finer = self._course(problem, FINER_STEP.format(problem.physics_dt))
-        end = finer.way.near(x, NEAR)
-        if not end.score < score:
-            return None
-        self._use(finer)
-        return Outcome(x=end.x, stop_reasons=[end.stop_reason])
+        finer = self._way_at_half_the_step()
+        self.progress.say(f"the physics step shows: going on with one of {_ms(finer)}")
+        end = finer.near(x, NEAR)
+        return self._ended(finer, end) if end.score < score else None
 
     def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
         """Bring the optimizers to where the checkpoint has them."""
@@ -378,8 +351,8 @@ class Optimization:
             if not keep_interrupted:
                 raise
             x = self._best_so_far()
-            self._use(next((c for c in self._courses if any(d.x is x for d in c.way.descents)), self._in_use))
-            return Outcome(x=x, stop_reasons=[_INTERRUPTED])
+            self.way = next((way for way in self.ways if any(d.x is x for d in way.descents)), self.way)
+            return Outcome(x=x, stop_reasons=[INTERRUPTED])
 
     def _optimize(self) -> Outcome:
         """PACE's search alone, or the way down: from the prior, or near a vector that is known."""
@@ -387,18 +360,26 @@ class Optimization:
             self._search(self.optimizer)
             return Outcome(x=self._best_of(self.optimizer), stop_reasons=self._search_stop)
         if self.settings.start is not None:
-            x, way = as_vector(self.problem, self.settings.start), self.way
+            x = as_vector(self.problem, self.settings.start)
             if self.problem.dataset.torques is not None:
-                self._use(self._course(self.problem.with_torque_noise(self._torque_noise(self.evaluator, x)), WEIGHED))
-                way = self._in_use.way
-            end = way.near(x, NEAR)
+                noise = self._torque_noise(self.way.evaluator, x)
+                self.way = self._way(self.problem.with_torque_noise(noise), "torque noise")
+            end = self.way.near(x, NEAR)
         else:
+            stated, starts = self.way, self._without_effects_too(self._first())
+            if not stated.is_on_whole:
+                best = stated.begin(starts)
+                if (found := self._scan(best.x)) is not None:
+                    starts.append(found)
+                    best = stated.begin(starts)
+                self._go_elsewhere(best)
+                if self.way is not stated:
+                    self.way.missing_score, starts = stated.missing_score, [best.x]
             searches = self.settings.optimizer != "least_squares"
-            starts = self._without_effects_too(self._first())
-            end = self.way.run(starts, self._search_within if searches else None, self._scan, self._elsewhere)
+            end = self.way.run(starts, self._search_within if searches else None)
         if not self._searched:
             self.processes.agree(None)  # there was nothing to share: the others may go
-        return Outcome(x=end.x, stop_reasons=[end.stop_reason])
+        return self._ended(self.way, end)
 
     def _first(self) -> torch.Tensor:
         """What is nearer on pieces: the prior's start, or the one that the balance of torques gives."""
@@ -406,9 +387,7 @@ class Optimization:
         if not self.problem.effects and self.problem.dataset.torques is None:  # which the balance does not have
             self.way.missing_score = left_over
         starts = torch.stack([self.problem.space.start, balanced])
-        with self._found_again(self.way.pieces):
-            scores = self.way.pieces.residuals(self.problem.space.to_physical(starts)).score
-        return starts[int(scores.nan_to_num(torch.inf).argmin())]
+        return starts[int(self._look(self.way.pieces, starts).score.nan_to_num(torch.inf).argmin())]
 
     def _without_effects_too(self, x: torch.Tensor) -> list[torch.Tensor]:
         """A start, and the same without the effects: a richer model also begins at the one that it contains."""
@@ -417,9 +396,8 @@ class Optimization:
 
     def _scan(self, x: torch.Tensor) -> torch.Tensor | None:
         """The best end of the first descents with frequencies of combs that explain more."""
-        problem = self.problem
-        effects = effect_cfgs(problem.env_cfg.sim2real.effects)
-        return scanned(problem.space, self._in_use.way.pieces, x, effects, problem.joint_names)
+        effects = effect_cfgs(self.problem.env_cfg.sim2real.effects)
+        return scanned(self.problem.space, self.way.pieces, x, effects, self.problem.joint_names)
 
     def _make_optimizer(self) -> CMAESOptimizer:
         """The search; a hybrid's is made when it begins."""
@@ -539,6 +517,10 @@ class Optimization:
         if self.optimizer is not None and self.optimizer.generation:
             return self._best_of(self.optimizer)
         return self.problem.space.start
+
+
+def _ms(way: WayDown) -> str:
+    return f"{1e3 * way.problem.physics_dt:g} ms"
 
 
 def with_structures(problem: Problem, start: Mapping[str, Any] | None, around: torch.Tensor | None = None) -> Problem:

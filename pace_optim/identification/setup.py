@@ -110,6 +110,7 @@ def make_optimizer(
 
 def make_searcher(problem: Problem, settings: FitSettings) -> Evaluator:
     """What scores the candidates of a search: the hybrid's only has to find the valley, for which a part is enough."""
+    problem = problem.for_search(settings.device)
     if settings.optimizer == "hybrid":
         problem = problem.on_pieces(WayDownCfg().share)
     return problem.training_evaluator()

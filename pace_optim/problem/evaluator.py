@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import torch
 
 from pace_envs.tasks.pace import TORQUE_OFFSET, TORQUE_SCALE
 from pace_optim.problem.free_phases import FreePhases, PhaseProbes, free_phases
-from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.problem.parameter_space import Colouring, ParameterSpace, colour
 from pace_optim.problem.rollout import Rollout
 from pace_optim.recording.dataset import Dataset, Torques
 from pace_optim.recording.noise import LEAST_NOISE, noise_variance
@@ -40,11 +40,6 @@ class Prior:
     def penalty(self) -> torch.Tensor:
         """What it adds to the sum of squared errors, (m,) [rad²]."""
         return self.noise * (self.x.square() @ self.precision)
-
-    @property
-    def gradient(self) -> torch.Tensor:
-        """Half of its derivative at the first candidate, (size,) [rad²]."""
-        return self.gradient_at(self.x[0])
 
     def gradient_at(self, x: torch.Tensor) -> torch.Tensor:
         """Half of its derivative, (size,) [rad²], at a candidate (size,)."""
@@ -139,7 +134,8 @@ class Evaluator:
         self.dataset = dataset
         self.space = space
         names = dataset.recordings[0].joint_names
-        self._trees = [[names.index(name) for name in tree] for tree in trees or [names]]
+        self._tree_names = trees or [names]
+        self._trees = [[names.index(name) for name in tree] for tree in self._tree_names]
         self.phases = phases
         """What is not known of free phases; ``None`` where no base moves, or no candidate has been simulated yet."""
         self._phases_at: torch.Tensor | None = None
@@ -147,9 +143,11 @@ class Evaluator:
         self._make_env = make_env
         self._nearby = nearby
         self._rollouts: dict[int, Rollout] = {}
-        self.simulations = 0
-        """Candidates simulated so far by :meth:`residuals`."""
-        self._again = 0
+
+    @cached_property
+    def colouring(self) -> Colouring:
+        """Which entries are perturbed together."""
+        return colour(self.space, self._tree_names, self.dataset.recordings[0].joint_names)
 
     @property
     def looks_coarser(self) -> bool:
@@ -159,17 +157,8 @@ class Evaluator:
     @property
     def simulated_steps(self) -> int:
         """Control steps simulated so far, over all environments."""
-        own = sum(rollout.simulated_steps for rollout in self._rollouts.values()) - self._again
+        own = sum(rollout.simulated_steps for rollout in self._rollouts.values())
         return own if self._nearby is None else own + self._nearby.simulated_steps
-
-    @contextlib.contextmanager
-    def again(self) -> Iterator[None]:
-        """What is simulated in the block was counted before: a run that goes on finds again what it had not kept."""
-        before = self.simulated_steps
-        try:
-            yield
-        finally:
-            self._again += self.simulated_steps - before
 
     def rollout(self, num_candidates: int) -> Rollout:
         """The rollout of that many candidates."""
@@ -181,8 +170,8 @@ class Evaluator:
     def look_around(
         self,
         physical: torch.Tensor,
-        where: torch.Tensor | None = None,
-        own_step: bool = False,
+        *,
+        own_step: bool,
         initial_offset: torch.Tensor | None = None,
     ) -> tuple[Residuals, Residuals]:
         """The residuals of the first candidate (m = 1), and those of all whose differences count.
@@ -190,18 +179,16 @@ class Evaluator:
         The latter are simulated at a longer physics step where there is one, and the first candidate does not diverge.
 
         Args:
-            physical: Physical parameters, (m, size).
-            where: As for :meth:`residuals`.
             own_step: Whether they are not.
             initial_offset: As for :meth:`residuals`; none for the first candidate.
         """
         if self._nearby is not None and not own_step:
-            here = self.residuals(physical[:1], where)
+            here = self.residuals(physical[:1])
             self._nearby.phases, self._nearby._phases_at = self.phases, self._phases_at
-            every = self._nearby.residuals(physical, where, initial_offset)
+            every = self._nearby.residuals(physical, initial_offset=initial_offset)
             if bool(every.error[0].isfinite().all()):
                 return here, every
-        every = self.residuals(physical, where, initial_offset)
+        every = self.residuals(physical, initial_offset=initial_offset)
         return every.rows(0, 1), every
 
     def residuals(
@@ -213,12 +200,10 @@ class Evaluator:
         """Simulate candidates and keep their errors.
 
         Args:
-            physical: Physical parameters, (m, size).
             where: Which samples count, (T, R) bool; ``None`` means those to train on.
             initial_offset: Added to each recording's first position, (m, n) [rad].
         """
         self.look_at_phases(physical[0])
-        self.simulations += len(physical)
         widest = max(1, _WIDEST // self.dataset.num_recordings)
         offsets = [None] * len(physical) if initial_offset is None else initial_offset.split(widest)
         parts = [
@@ -232,14 +217,14 @@ class Evaluator:
         Nothing where no base moves. The first candidate that is simulated is one.
 
         Args:
-            physical: Its parameters, (size,).
             anew: Whether to do it although that is known of another candidate.
 
         Returns:
             Whether errors are others from now on.
         """
-        known = self.phases is not None and (self._phases_at is None or not anew)
-        if self.dataset.carried is None or known or (anew and _same(self._phases_at, physical)):
+        at = self._phases_at
+        known = self.phases is not None and (at is None or not anew)
+        if self.dataset.carried is None or known or (anew and at is not None and torch.equal(at, physical)):
             return False
         for each in (self, self._nearby):
             if each is not None:
@@ -345,7 +330,3 @@ class Evaluator:
             self._noise = max(noise_variance(trained), LEAST_NOISE**2)
         x = self.space.to_normalised(physical.to("cpu", torch.float64))
         return Prior(x=x, precision=std.pow(-2), noise=self._noise)
-
-
-def _same(one: torch.Tensor | None, other: torch.Tensor) -> bool:
-    return one is not None and torch.equal(one, other)

@@ -40,6 +40,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
+from scipy import ndimage
 
 from pace_optim.recording.moving_base import Carried
 
@@ -133,7 +134,6 @@ class FreePhases:
         Args:
             error: (m, K, R, n) [rad].
             step: Control step of each of the K, ascending, (K,).
-            where: Which samples count, (T, R) bool.
         """
         for block, (begin, end, factor) in zip(self.blocks, self._where(step, where), strict=True):
             if begin < end:
@@ -149,7 +149,6 @@ class FreePhases:
 
         Args:
             step: Control step of each of the K, ascending, (K,).
-            where: Which samples count, (T, R) bool.
         """
         if self.expected is None:
             return
@@ -196,9 +195,9 @@ def blocks_of(carried: Carried, trees: Sequence[Sequence[int]]) -> tuple[Block, 
     result = []
     for r in carried.moves.nonzero()[:, 0].tolist():
         for tree in trees:
-            free = carried.free[:, r, list(tree)].all(dim=1).numpy().astype(int)
-            edges = np.flatnonzero(np.diff(np.concatenate([[0], free, [0]])))
-            for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+            free = carried.free[:, r, list(tree)].all(dim=1).numpy()
+            for (phase,) in ndimage.find_objects(ndimage.label(free)[0]):
+                first, end = phase.start, phase.stop
                 parts = max(1, round((end - first) / _BLOCK))
                 cuts = [first + (end - first) * i // parts for i in range(parts + 1)]
                 result += [
@@ -331,7 +330,6 @@ def free_phases(
     Args:
         change: What :class:`PhaseProbes` change of what encoders show at all control steps, (2 depth + 6, T, R, n).
         error: Of the candidate without those changes, (T, R, n) [rad].
-        control_dt: [s].
     """
     turning = carried.base[..., :3].diff(dim=0) / control_dt
     influence = _Influence(

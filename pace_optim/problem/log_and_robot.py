@@ -121,9 +121,7 @@ def without_loops_of_torques(env: ManagerBasedRLEnv, recording: Recording) -> Re
     A damping that the recording states stays: it acts on the measured speed.
     """
     drive, names = recording.drive, np.array(recording.joint_names)
-    stiffness, damping = (
-        of_joints(env, name) if (own := getattr(drive, name)) is None else own for name in ("stiffness", "damping")
-    )
+    stiffness, damping = gains(env, recording)
     other = recording.has_velocity_command | recording.has_effort_command
     idle = names[recording.has_position_command & ~other & (stiffness == 0.0)].tolist()
     if idle and drive.stiffness is None:
@@ -252,7 +250,7 @@ _TIMES_ASKED = 2.0
 def drive_reach(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> dict[str, float]:
     """The largest torque of each joint's drive [N m]: its limit, else twice what was asked; infinite: not known."""
     limit = np.max([_limit(env, recording) for recording in recordings], axis=0)
-    asked = np.max([np.abs(_asked(env, recording)).max(axis=0) for recording in recordings], axis=0)
+    asked = np.max([np.abs(asked_torque(env, recording)).max(axis=0) for recording in recordings], axis=0)
     largest = np.where(np.isfinite(limit), limit, np.where(asked > 0, _TIMES_ASKED * asked, math.inf))
     return dict(zip(env.scene["robot"].joint_names, largest.tolist(), strict=True))
 
@@ -276,7 +274,7 @@ def with_work(dataset: Dataset, env: ManagerBasedRLEnv) -> Dataset:
     for start, recording in zip(dataset.session_start.tolist(), dataset.recordings, strict=True):
         since = recording.time - recording.time[0]
         edges = np.linspace(0.0, since[-1], max(1, round(since[-1] / _BIN)) + 1)
-        square = np.nan_to_num(_asked(env, recording)) ** 2
+        square = np.nan_to_num(asked_torque(env, recording)) ** 2
         bins = (np.searchsorted(edges, since, side="right") - 1).clip(max=len(edges) - 2)
         count = np.bincount(bins, minlength=len(edges) - 1).clip(min=1)
         squares.append([np.bincount(bins, column, len(edges) - 1) / count for column in square.T])
@@ -287,12 +285,6 @@ def with_work(dataset: Dataset, env: ManagerBasedRLEnv) -> Dataset:
         return dataset
     begin, end, square = (torch.as_tensor(np.concatenate(each, axis=-1)) for each in (begins, ends, squares))
     return replace(dataset, work=Work(begin=begin, end=end, square=square.T))
-
-
-def _asked(env: ManagerBasedRLEnv, recording: Recording) -> np.ndarray:
-    """What drives were asked for, within the limit in force, (T, n) [N m]."""
-    limit = _limit(env, recording)
-    return np.clip(asked_torque(env, recording), -limit, limit)
 
 
 def _limit(env: ManagerBasedRLEnv, recording: Recording) -> np.ndarray:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import torch
@@ -229,3 +230,51 @@ class ParameterSpace:
         """
         tree_of = {joint: t for t, joints in enumerate(trees) for joint in joints}
         return [None if key == GLOBAL else tree_of[key] for p in self.parameters for key in p.joints or p.keys]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Colouring:
+    """Which entries of the parameter vector are perturbed together, and which joints each of them moves."""
+
+    colours: tuple[tuple[int, ...], ...]
+    """Entries perturbed together."""
+    joints: tuple[tuple[int, ...], ...]
+    """For each entry of the vector, the indices of the joints that it moves."""
+    sensors: tuple[int, ...] = ()
+    """Entries that change what sensors show, and no motion: each is perturbed without the others of its tree."""
+
+    @cached_property
+    def row_of(self) -> dict[int, int]:
+        """The colour of each entry that is not fixed, which is its row of a Jacobian."""
+        return {entry: c for c, entries in enumerate(self.colours) for entry in entries}
+
+    def moving(self, joints: Iterable[int]) -> list[int]:
+        """Entries that move any of some joints."""
+        own = set(joints)
+        return [entry for entry in self.row_of if own & set(self.joints[entry])]
+
+
+def colour(space: ParameterSpace, trees: Sequence[Sequence[str]], joint_names: Sequence[str]) -> Colouring:
+    """Group entries that move different joints: the i-th of each tree together, shared ones alone.
+
+    Entries whose bounds are equal are fixed: they belong to no colour and move no joint.
+
+    Args:
+        trees: Groups of joints that do not influence each other.
+    """
+    index = {name: i for i, name in enumerate(joint_names)}
+    owners = space.owners(trees)
+    by_tree: list[list[int]] = [[] for _ in trees]
+    alone: list[int] = []
+    free = (space.upper > space.lower).tolist()
+    for entry, owner in enumerate(owners):
+        if free[entry]:
+            (alone if owner is None else by_tree[owner]).append(entry)
+    depth = max((len(entries) for entries in by_tree), default=0)
+    colours = [tuple(entries[i] for entries in by_tree if i < len(entries)) for i in range(depth)]
+    joints = tuple(
+        tuple(index[name] for name in (joint_names if owner is None else trees[owner])) if free[entry] else ()
+        for entry, owner in enumerate(owners)
+    )
+    sensors = tuple(entry for entry, moves in enumerate(space.moves.tolist()) if not moves)
+    return Colouring(colours=(*colours, *((entry,) for entry in alone)), joints=joints, sensors=sensors)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import torch
 
@@ -45,7 +45,7 @@ from pace_optim.problem.log_and_robot import (
     without_loops_of_torques,
 )
 from pace_optim.problem.moving_base import BasePath, base_path, on_moving_base
-from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.problem.parameter_space import Colouring, ParameterSpace, colour
 from pace_optim.problem.recordings import Logs, conform_all, motors_of_logs, read_logs, tell_on_stderr
 from pace_optim.problem.unknown_facts import GAINS, LIMITS, lift_limits, refined_limits, with_unknown
 from pace_optim.recording import Recording
@@ -143,10 +143,15 @@ class Problem:
         cfg.sim.class_type = simulation or cfg.sim.class_type
         return ManagerBasedRLEnv(cfg)
 
-    def with_effects(self, effects: Sequence[EffectCfg | str]) -> Problem:
+    def with_effects(self, effects: Sequence[EffectCfg | str]) -> Self:
         """The same recordings with other effects."""
         cfg = _configured(self.plain_cfg, self.physics_dt, effects)
         return replace(self, env_cfg=cfg, space=ParameterSpace.of(cfg.sim2real))
+
+    @cached_property
+    def colouring(self) -> Colouring:
+        """Which entries are perturbed together."""
+        return colour(self.space, self.trees, self.joint_names)
 
     @property
     def structures(self) -> dict[str, tuple[float, ...]]:
@@ -206,16 +211,12 @@ class Problem:
             change(each.sim2real)
         return replace(self, plain_cfg=plain, env_cfg=cfg, space=ParameterSpace.of(cfg.sim2real))
 
-    def with_physics_dt(self, physics_dt: float) -> Problem:
+    def with_physics_dt(self, physics_dt: float) -> Self:
         """The same with another physics step [s]."""
         return replace(self, env_cfg=_configured(self.plain_cfg, physics_dt, self.env_cfg.sim2real.effects))
 
-    def with_drive_dt(self, drive_dt: float) -> Problem:
-        """The same with another step of the drives' own loops, and a physics step that fits it [s]; 0: continuous."""
-        return replace(self.with_loop(drive_dt), assumed_loop=None)
-
     def with_loop(self, drive_dt: float, physics_dt: float | None = None) -> Problem:
-        """The same with another step of loops whose step remains assumed, and a physics step of at most that [s]."""
+        """The same with another step of the drives' loops, and a physics step of at most that [s]; 0: continuous."""
         plain = copy.deepcopy(self.plain_cfg)
         _set_drive_dt(plain, drive_dt)
         set_drive_rate(plain)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -196,25 +196,23 @@ class Rollout:
 
     def __iter__(self) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
         """Simulate up to the last sample that counts; yields (sim_dof_pos, real_dof_pos) at every sample."""
-        return self._pairs(None)
+        return self._pairs(self.samples())
 
     def at_once(self) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
         """The same pairs, for those who read nothing else of the robot: drives that can be compiled simulate first."""
         size = self.duration_steps * self.env.num_envs * self.robot.num_joints
         if size > _LARGEST or self.env.device.type != "cpu":
-            return self._pairs(None)
-        return self._pairs(lambda steps: self._in_one_go(torch.arange(steps)))
+            return iter(self)
+        return self._pairs(enumerate(self.positions(torch.arange(self.duration_steps))))
 
-    def _pairs(
-        self, simulated: Callable[[int], Iterable[torch.Tensor]] | None
-    ) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
-        """Pairs of simulated and measured positions; ``simulated`` as for :meth:`samples`."""
+    def _pairs(self, samples: Iterable[tuple[int, torch.Tensor]]) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+        """Pairs of simulated and measured positions, of samples as :meth:`samples` gives them."""
         data = self.dataset
         weights = (self._where.double() / self._where.sum()).to(self.env.dtype)
         counts = self._where.any(dim=1).tolist()
         self._is_late = self.observation_lag(self.duration_steps) is not None
         self._contacts_at = -1
-        for k, sim_dof_pos in self.samples(simulated):
+        for k, sim_dof_pos in samples:
             self._step = k
             if counts[k]:
                 self.weight = self._rows(weights[k, :, None])
@@ -228,10 +226,10 @@ class Rollout:
         Args:
             at: Control steps of the samples, ascending, the last one that counts among them.
         """
-        reading = self._reading(self.duration_steps)
+        steps, reading = self.duration_steps, self.reading(self.duration_steps)
         if reading is None:
             return self._in_one_go(at)
-        return self._shown(reading, at, lambda steps: self._in_one_go(torch.arange(steps)))
+        return self._read(reading, at, self._in_one_go(torch.arange(steps + reading.ahead)))
 
     def positions_and_torques(self, at: torch.Tensor, sensed: Torques) -> tuple[torch.Tensor, torch.Tensor]:
         """The same, and the motors' torques as late as sensors show them, both (len(at), num_envs, n) [rad, N m].
@@ -244,32 +242,30 @@ class Rollout:
         """
         last, offset, after = self.duration_steps, self.dataset.sample_offset, sensed.after[at]
         beyond = 2 + math.ceil(max(0.0, float(after.max()) - float(sensed.lag.min())))
-        torques: list[torch.Tensor] = []
-
-        def simulated(steps: int) -> torch.Tensor:
-            shape = steps + beyond, self.env.num_envs, self.robot.num_joints
-            torques.append(torch.zeros(shape, dtype=self.env.dtype))
-            return self._in_one_go(torch.arange(steps + beyond), torque=torques[0])[:steps]
-
-        lag, reading = self.observation_lag(last), self._reading(last)
-        positions = simulated(last)[at] if reading is None else self._shown(reading, at, simulated)
+        lag, reading = self.observation_lag(last), self.reading(last)
+        steps = last if reading is None else last + reading.ahead
+        torque = torch.zeros(steps + beyond, self.env.num_envs, self.robot.num_joints, dtype=self.env.dtype)
+        seen = self._in_one_go(torch.arange(steps + beyond), torque=torque)[:steps]
+        positions = seen[at] if reading is None else self._read(reading, at, seen)
         after = after if offset is None else after + offset[at]
         when = torch.stack([self._rows(each[:, None]) for each in at[:, None] + after]).expand_as(positions)
         if lag is not None:
             when = when - torch.lerp(lag[0], lag[1], (at / max(1, last - 1))[:, None, None])
-        return positions, _straight(torques[0], when - sensed.lag)
+        return positions, _straight(torque, when - sensed.lag)
 
     def motion(self, steps: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Simulate that many control steps, as :meth:`simulated` does.
+        """Simulate that many control steps.
 
         Returns:
-            Sensed positions at each, (steps, num_envs, n) [rad], and there MuJoCo's positions, (steps, num_envs, nq),
-            and speeds, (steps, num_envs, nv).
+            Sensed positions at each, as late as the effects on the recording have them, (steps, num_envs, n) [rad], and
+            there MuJoCo's positions, (steps, num_envs, nq), and speeds, (steps, num_envs, nv).
         """
-        sim, sizes = self.env.sim, [self.env.sim.qpos.shape[1], self.env.sim.qvel.shape[1]]
-        state = torch.empty(steps, self.env.num_envs, sum(sizes), dtype=sim.dtype, device=sim.device)
-        positions, speeds = state.split(sizes, dim=-1)
-        return self._in_one_go(torch.arange(steps), state), positions, speeds
+        sim, reading = self.env.sim, self.reading(steps)
+        count, sizes = steps if reading is None else steps + reading.ahead, [sim.qpos.shape[1], sim.qvel.shape[1]]
+        state = torch.empty(count, self.env.num_envs, sum(sizes), dtype=sim.dtype, device=sim.device)
+        seen = self._in_one_go(torch.arange(count), state)
+        positions, speeds = (each.contiguous() for each in state[:steps].split(sizes, dim=-1))
+        return seen if reading is None else self._read(reading, torch.arange(steps), seen), positions, speeds
 
     def _in_one_go(
         self, at: torch.Tensor, state: torch.Tensor | None = None, torque: torch.Tensor | None = None
@@ -313,41 +309,36 @@ class Rollout:
         self.simulated_steps += last * self.env.num_envs
         return result
 
-    def samples(
-        self, simulated: Callable[[int], Iterable[torch.Tensor]] | None = None
-    ) -> Iterator[tuple[int, torch.Tensor]]:
+    def samples(self) -> Iterator[tuple[int, torch.Tensor]]:
         """Step and sensed positions at every control step, as late as the effects on the recording have them.
 
-        Args:
-            simulated: Gives the positions at so many control steps; ``None``: :meth:`simulated`.
+        The robot is simulated meanwhile, so that all else of it can be read; of positions only the last are kept.
         """
-        simulated, steps = simulated or self.simulated, self.duration_steps
-        reading = self._reading(steps)
+        steps, reading = self.duration_steps, self.reading(self.duration_steps)
         if reading is None:
-            yield from enumerate(simulated(steps))
+            yield from enumerate(self.simulated(steps))
             return
         length = reading.ahead + reading.behind + 1
         shape = length, self.env.num_envs, self.robot.num_joints
         seen = torch.zeros(shape, dtype=self.env.dtype, device=self.env.device)
-        for j, position in enumerate(simulated(steps + reading.ahead)):
+        for j, position in enumerate(self.simulated(steps + reading.ahead)):
             seen[j % length] = position
             if j == 0:
                 seen[:] = position
             if (k := j - reading.ahead) >= 0:
                 shown = seen[k % length].clone()
-                at = self._taken_at(reading, torch.tensor([k], device=self.env.device))
+                at = reading.taken_at(torch.tensor([k], device=self.env.device), reading.late)
                 shown[reading.late] = between_steps(seen[:, reading.late], at, ring=True)[0]
                 yield k, shown
 
-    def _shown(self, reading: _Reading, at: torch.Tensor, simulated: Callable[[int], torch.Tensor]) -> torch.Tensor:
-        """The same at some steps, read between those that are simulated at once, (len(at), num_envs, n) [rad]."""
-        seen = simulated(self.duration_steps + reading.ahead)
+    def _read(self, reading: Reading, at: torch.Tensor, seen: torch.Tensor) -> torch.Tensor:
+        """The same at some steps, read between positions at all steps, (len(at), num_envs, n) [rad]."""
         shown, own = seen[at], seen[:, reading.late]
         for rows in torch.arange(len(at)).split(_READ_AT_ONCE):
-            shown[rows[:, None], reading.late] = between_steps(own, self._taken_at(reading, at[rows]))
+            shown[rows[:, None], reading.late] = between_steps(own, reading.taken_at(at[rows], reading.late))
         return shown
 
-    def _reading(self, steps: int) -> _Reading | None:
+    def reading(self, steps: int) -> Reading | None:
         """How samples are taken between steps; ``None``: at the steps themselves."""
         lag, offset = self.observation_lag(steps), self.dataset.sample_offset
         if lag is None and offset is None:
@@ -356,20 +347,14 @@ class Rollout:
             lag = torch.zeros(2, self.env.num_envs, self.robot.num_joints, dtype=self.env.dtype, device=self.env.device)
         most = 0.0 if offset is None else float(offset.abs().max())
         moved = (lag != 0).any(dim=2).any(dim=0)
-        late = (moved if offset is None else torch.ones_like(moved)).nonzero()[:, 0]
-        return _Reading(
-            late=late,
-            first=lag[0, late],
-            rate=(lag[-1, late] - lag[0, late]) / max(1, steps - 1),
+        return Reading(
+            late=(moved if offset is None else torch.ones_like(moved)).nonzero()[:, 0],
+            first=lag[0],
+            rate=(lag[-1] - lag[0]) / max(1, steps - 1),
+            offset=offset,
             ahead=max(0, math.ceil(most - float(lag.min()))) + 2,
             behind=max(0, math.ceil(most + float(lag.max()))) + 2,
         )
-
-    def _taken_at(self, reading: _Reading, steps: torch.Tensor) -> torch.Tensor:
-        """When the late samples of some steps are taken, (len(steps), late, n) [control steps]."""
-        k = steps[:, None, None].to(self.env.dtype)
-        at, offset = k - (reading.first + reading.rate * k), self.dataset.sample_offset
-        return at if offset is None else at + offset[steps].repeat(1, self.num_candidates)[:, reading.late, None]
 
     def observation_lag(self, steps: int) -> torch.Tensor | None:
         """How late the first and the last sample are [control steps], (2, num_envs, n); ``None``: never."""
@@ -531,18 +516,32 @@ class Rollout:
             self.robot.add_body_mass(body, mass, rows, place=recording.load.added_mass_at.get(body))
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Reading:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reading:
     """Samples of step k are taken at k - lag + offset: some steps are simulated ahead, some are remembered."""
 
     late: torch.Tensor
     """Environments whose samples are not taken at the steps."""
     first: torch.Tensor
-    """Their lag at the first step, (late, n) [control steps]."""
+    """The lag of each environment at the first step, (num_envs, n) [control steps]."""
     rate: torch.Tensor
     """What it grows by with each: lags are linear in time."""
+    offset: torch.Tensor | None
+    """Of the recordings, (T, R)."""
     ahead: int
     behind: int
+
+    def taken_at(self, steps: torch.Tensor, envs: torch.Tensor) -> torch.Tensor:
+        """When samples of some steps are taken in some environments, (len(steps), len(envs), n) [control steps]."""
+        k = steps[:, None, None].to(self.first.dtype)
+        at = k - (self.first[envs] + self.rate[envs] * k)
+        return at if self.offset is None else at + self.offset[steps][:, envs % self.offset.shape[1], None]
+
+    def to(self, device: torch.device) -> Reading:
+        """The same on a device."""
+        offset = None if self.offset is None else self.offset.to(device)
+        late, first, rate = (each.to(device) for each in (self.late, self.first, self.rate))
+        return replace(self, late=late, first=first, rate=rate, offset=offset)
 
 
 def _changes(enable: torch.Tensor | None) -> frozenset[int]:

@@ -38,10 +38,10 @@ def test_the_problem_has_36_parameters_and_our_simulation_replays_its_truth(case
 
 def test_fixed_entries_cost_no_simulation_and_keep_no_column(case):
     space = case.problem.space
-    coloured = sorted(entry for colour in case.colouring.colours for entry in colour)
+    coloured = sorted(entry for colour in case.problem.colouring.colours for entry in colour)
     assert coloured == sorted(case.fitted.tolist())
-    assert len(case.colouring.colours) == 9
-    assert all(case.colouring.joints[entry] == () for entry in range(space.size) if entry not in coloured)
+    assert len(case.problem.colouring.colours) == 9
+    assert all(case.problem.colouring.joints[entry] == () for entry in range(space.size) if entry not in coloured)
 
 
 def test_the_chirp_drives_the_drives_into_the_effort_limit_which_both_sides_have():

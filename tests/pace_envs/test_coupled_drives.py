@@ -18,7 +18,6 @@ from pace_envs.model_file import read_model_file
 from pace_envs.motor_coordinates import DrivenJoints
 from pace_envs.robot_spec import load_robot_spec
 from pace_envs.task_source import EnvironmentRecord
-from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.export import export
 from pace_optim.joints.simulation import reference_path, twin_problem
@@ -197,9 +196,8 @@ def test_a_log_states_the_motors_that_the_model_file_lacks(wrist, tmp_path):
 
 def test_a_fit_finds_the_motors(wrist):
     problem = wrist.problem
-    colouring = colour(problem.space, problem.trees, problem.joint_names)
     evaluator, cfg = problem.training_evaluator(), LeastSquaresCfg(max_iteration=6)
-    best = least_squares(evaluator, colouring, [problem.space.start], cfg)[0]
+    best = least_squares(evaluator, [problem.space.start], cfg)[0]
     found = problem.space.to_dict(problem.space.to_physical(best.x))
     for name in ("armature", "viscous_friction", "friction"):
         assert list(found[name].values()) == pytest.approx(WRIST.truth[name], rel=0.02)

@@ -19,7 +19,6 @@ from pace_envs.link_inertia import NAMES, PARTS, POSITIVE, TEN, Reference
 from pace_envs.tasks.pace import PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg, sought_links
 from pace_optim.diagnosis.diagnosis_cfg import DiagnosisCfg, LinksCfg
 from pace_optim.diagnosis.wrong_links import LinkFindings, WrongLink, _best_load, find_wrong_links, listed_candidates
-from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.error_bars.undetermined import undetermined
 from pace_optim.estimate.least_squares import LeastSquaresCfg, least_squares
@@ -113,7 +112,6 @@ def fit(problem, iterations: int = 10, held: tuple[str, ...] = ()):
             physical[problem.space[name]] = TRUE[name]
         labels = [label for label in problem.space.labels if label.split("/")[0] in held]
         problem = dataclasses.replace(problem, space=problem.space.holding(labels, physical))
-    colouring = colour(problem.space, problem.trees, problem.joint_names)
     evaluator = problem.training_evaluator()
     start = problem.space.start.clone()
     known = {name: value for name, value in TRUE.items() if name != "encoder_bias"}
@@ -121,8 +119,8 @@ def fit(problem, iterations: int = 10, held: tuple[str, ...] = ()):
         physical = problem.space.to_physical(start)
         physical[problem.space[name]] = value
         start[problem.space[name]] = problem.space.to_normalised(physical)[problem.space[name]]
-    best = least_squares(evaluator, colouring, [start], LeastSquaresCfg(max_iteration=iterations))[0]
-    return best.x, assess(problem, problem.evaluator(), colouring, best.x, ended=best).uncertainty
+    best = least_squares(evaluator, [start], LeastSquaresCfg(max_iteration=iterations))[0]
+    return best.x, assess(problem, problem.evaluator(), best.x, ended=best).uncertainty
 
 
 def test_any_parameters_are_those_of_a_body_that_mujoco_compiles():

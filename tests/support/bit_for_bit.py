@@ -5,9 +5,8 @@ import sys
 import torch
 from problems import chirp, make_problem, record
 
-from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.least_squares import Descent, checkpoint_of
-from pace_optim.estimate.way_down import WayDown
+from pace_optim.estimate.way_down import WayDown, WayDownCfg
 
 
 def main() -> None:
@@ -15,11 +14,11 @@ def main() -> None:
     torch.set_num_threads(int(sys.argv[1]))
     coarse = make_problem(record(chirp(0.5), noise=1e-4))
     problem = coarse.with_physics_dt(coarse.physics_dt / 2)
-    colouring = colour(problem.space, problem.trees, problem.joint_names)
 
     def way(**options):
-        pieces = problem.on_pieces(0.25).training_evaluator()
-        return WayDown(problem.training_evaluator(), colouring, pieces=pieces, **options)
+        result = WayDown(problem, cfg=WayDownCfg(share=0.25), **options)
+        result.noise_score = 0.0
+        return result
 
     kept: list = []
     whole = way(on_iteration=lambda _: kept.append(checkpoint_of(first.descents)))

@@ -4,9 +4,9 @@ import numpy as np
 import torch
 
 from pace_envs.tasks.pace import Parameter
-from pace_optim.estimate.derivatives import Colouring, Jacobian
+from pace_optim.estimate.derivatives import Jacobian
 from pace_optim.problem.evaluator import Residuals
-from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.problem.parameter_space import Colouring, ParameterSpace
 
 
 def linear(columns, error, names=None):

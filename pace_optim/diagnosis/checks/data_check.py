@@ -12,12 +12,12 @@ import torch
 from pace_actuators.joint_units import JOINT_TYPES, JointType, units_for
 from pace_actuators.text import plural
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, JudgingCfg
+from pace_optim.estimate.error_bars.physics_step import step_error
 from pace_optim.joints.fits.base_fit import whole_robot
 from pace_optim.joints.fits.fits import Fits
 from pace_optim.joints.fits.fitted import Fitted
 from pace_optim.joints.simulation.problem import TwinProblem
 from pace_optim.problem.problem import Problem
-from pace_optim.problem.step_error import step_error
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import session_starts
 from pace_optim.recording.noise import noise_floor

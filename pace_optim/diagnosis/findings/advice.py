@@ -11,8 +11,7 @@ from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.verdict.names import curves_in, new_effects
 from pace_optim.diagnosis.verdict.verdict import confounded
 from pace_optim.joints.fits.fitted import Fitted
-from pace_optim.joints.fits.labels import found_effects
-from pace_optim.joints.fits.model import whole_values
+from pace_optim.joints.fits.model import found_effects, whole_values
 from pace_optim.motion.design.telling_apart import Rivals, RobotModel, next_experiments
 from pace_optim.problem.problem import Problem
 from pace_optim.run.result import drive_in_force

@@ -28,8 +28,7 @@ from pace_optim.diagnosis.verdict.sizes import factor_of, sizes, without_error_b
 from pace_optim.diagnosis.verdict.verdict import likes, part_explained, ranking, restricted, verdict
 from pace_optim.diagnosis.wrong_links import LinkFindings
 from pace_optim.joints.fits.fits import Fits
-from pace_optim.joints.fits.labels import labels
-from pace_optim.joints.fits.model import JointModel
+from pace_optim.joints.fits.model import JointModel, labels
 from pace_optim.problem.problem import Problem
 from pace_optim.run.result import FitResult
 from pace_optim.run.settings import FitSettings, command_line

@@ -9,8 +9,8 @@ import torch
 
 from pace_actuators.effects import Effect, EffectParameter
 from pace_optim.diagnosis.search.state import Outcome
+from pace_optim.estimate.error_bars.physics_step import FINER, TO_NO_STEP
 from pace_optim.estimate.error_bars.uncertainty import ANYWHERE, sandwich
-from pace_optim.estimate.error_bars.undetermined import FINER, TO_NO_STEP
 from pace_optim.joints.fits.fits import Fits
 from pace_optim.joints.fits.fitted import Fitted
 from pace_optim.joints.simulation.problem import TwinProblem

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from pace_optim.estimate.derivatives import TIMES_NOISE, Colouring, Jacobian, Stencil, stencil
+from pace_optim.estimate.derivatives import TIMES_NOISE, Jacobian, Stencil, stencil
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty, estimate_uncertainty
 from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, by_chords
 from pace_optim.problem.evaluator import Evaluator, Residuals
 from pace_optim.problem.free_phases import FreePhases
-from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 
 _MOST_LOOKS = 3
@@ -44,25 +43,20 @@ class Assessment:
     phases: FreePhases | None
     """What its residuals have taken out of free phases; ``None`` where no base moves."""
 
-    def moved(
-        self, problem: Problem, evaluator: Evaluator, training: Evaluator, x: torch.Tensor, held: Sequence[str] = ()
-    ) -> Assessment:
+    def moved(self, evaluator: Evaluator, training: Evaluator, x: torch.Tensor, held: Sequence[str] = ()) -> Assessment:
         """The same of a vector nearby, with these derivatives.
 
         Args:
-            problem: What was fitted, or the same with other facts.
-            x: The vector, normalised (size,).
             held: Labels of what is held where it is.
         """
-        residuals = training.residuals(problem.space.to_physical(x)[None])
+        residuals = training.residuals(training.space.to_physical(x)[None])
         there = replace(self.jacobian, residuals=residuals)
-        return _assessment(problem, evaluator, training, x, there, self.initial, self.noise, held)
+        return _assessment(evaluator, training, x, there, self.initial, self.noise, held)
 
 
 def assess(
     problem: Problem,
     evaluator: Evaluator,
-    colouring: Colouring,
     x: torch.Tensor,
     ended: Descent | None = None,
     training: Evaluator | None = None,
@@ -73,7 +67,6 @@ def assess(
     descent ended early, and x goes on to the minimum here.
 
     Args:
-        x: Normalised, (size,).
         ended: What ended there or near it, which knows the principal directions; ``None``: they are looked for.
         training: Simulates what is trained on; ``None``: the problem's own.
     """
@@ -83,7 +76,7 @@ def assess(
     ended_early = ended is not None and bool(ended.stop_reason) and training.looks_coarser
     for _ in range(1 + _MOST_LOOKS):
         training.look_at_phases(problem.space.to_physical(x), anew=True)
-        around = stencil(x, colouring, hessian, noise, score)
+        around = stencil(x, training.colouring, hessian, noise, score)
         shake = max(_INITIAL_STEP, min(TIMES_NOISE * noise, score**0.5))
         probes = make_probes(x, around, problem.trees, problem.joint_names, shake)
         here, every = training.look_around(
@@ -97,11 +90,10 @@ def assess(
         if not blind and gained <= LeastSquaresCfg().near_enough * score:
             break
         hessian, _ = there.normal_equations()
-    return _assessment(problem, evaluator, training, x, there, initial, noise)
+    return _assessment(evaluator, training, x, there, initial, noise)
 
 
 def _assessment(
-    problem: Problem,
     evaluator: Evaluator,
     training: Evaluator,
     x: torch.Tensor,
@@ -113,10 +105,10 @@ def _assessment(
     """Error bars from derivatives at x or near it."""
     middle = None
     if training.phases is not None and there.residuals.weight is not None:
-        late = _late_forces(there, training, problem.space, x)
+        late = _late_forces(there, training, x)
         middle = _middle_of_swings(there, training.phases, training.dataset.train) + np.outer(late, late)
-    uncertainty = estimate_uncertainty(there, problem.space, x, initial.derivatives, initial.joints, held, middle)
-    physical = problem.space.to_physical(x)
+    uncertainty = estimate_uncertainty(there, training.space, x, initial.derivatives, initial.joints, held, middle)
+    physical = evaluator.space.to_physical(x)
     if evaluator.dataset.num_recordings == training.dataset.num_recordings:
         evaluator.phases = training.phases
     else:
@@ -124,7 +116,7 @@ def _assessment(
     return Assessment(
         x=x,
         uncertainty=uncertainty,
-        residuals=evaluator.residuals(physical[None], problem.dataset.sampled),
+        residuals=evaluator.residuals(physical[None], evaluator.dataset.sampled),
         jacobian=there,
         noise=noise,
         initial=initial,
@@ -144,7 +136,6 @@ def _middle_of_swings(jacobian: Jacobian, phases: FreePhases, trained: torch.Ten
         trained: Where these samples are, (T, R) bool.
     """
     residuals, colouring = jacobian.residuals, jacobian.colouring
-    row = {entry: c for c, entries in enumerate(colouring.colours) for entry in entries}
     total = np.zeros((len(colouring.joints), len(colouring.joints)))
     if residuals.weight is None:
         return total
@@ -155,8 +146,8 @@ def _middle_of_swings(jacobian: Jacobian, phases: FreePhases, trained: torch.Ten
             continue
         at, rows = torch.arange(begin, end)[kept], kept[:, None].expand(-1, len(joints)).flatten()
         scale = (residuals.weight[at, r][:, joints] * phases.floor[r, joints]).flatten()
-        entries = [entry for entry in row if set(joints) & set(colouring.joints[entry])]
-        own = jacobian.columns[[row[entry] for entry in entries]][:, at, r][..., joints].flatten(1) * scale
+        entries = colouring.moving(joints)
+        own = jacobian.columns[[colouring.row_of[entry] for entry in entries]][:, at, r][..., joints].flatten(1) * scale
         error = residuals.error[0, at, r][:, joints].flatten() / scale.clamp(min=1e-300)
         spread = expected[rows][:, rows]
         larger = max(1.0, float(error.square().sum() / spread.diagonal().sum()))
@@ -164,7 +155,7 @@ def _middle_of_swings(jacobian: Jacobian, phases: FreePhases, trained: torch.Ten
     return total
 
 
-def _late_forces(jacobian: Jacobian, evaluator: Evaluator, space: ParameterSpace, x: torch.Tensor) -> np.ndarray:
+def _late_forces(jacobian: Jacobian, evaluator: Evaluator, x: torch.Tensor) -> np.ndarray:
     """Jᵀc, (size,), with c how residuals change if forces act later than a walk's rows say, by :data:`_LATE`.
 
     A joint that feels kp (q* - q) - (kd + d) q̇ of a time τ ago moves, to first order, as one with the parameters
@@ -172,11 +163,9 @@ def _late_forces(jacobian: Jacobian, evaluator: Evaluator, space: ParameterSpace
         d - kp τ        a - (kd + d) τ        delay + τ
 
     of which no log shows τ. A simulator whose step h is semi-implicit logs positions that are h / 2 ahead.
-
-    Args:
-        x: Normalised, (size,).
     """
-    rollout, physical, slope = evaluator.rollout(1), space.to_physical(x), space.slope(x)
+    rollout, space = evaluator.rollout(1), evaluator.space
+    physical, slope = space.to_physical(x), space.slope(x)
     change, viscous = torch.zeros_like(jacobian.residuals.error[0]), space["viscous_friction"]
     for r in range(jacobian.residuals.num_recordings):
         kp, kd = torch.zeros(2, rollout.robot.num_joints, dtype=torch.float64)
@@ -229,7 +218,6 @@ def make_probes(
     """What to simulate for the error bars at x.
 
     Args:
-        x: Normalised vector, (size,).
         around: Vectors around x that give the derivatives.
         trees: Groups of joints that do not influence each other.
         shake: How far first positions are moved [rad].

@@ -11,11 +11,12 @@ import torch
 from pace_actuators.text import capitalised, plural
 from pace_envs import ManagerBasedEnv
 from pace_envs.tasks.pace import GLOBAL, Parameter
-from pace_optim.estimate.derivatives import Jacobian, colour, stencil
+from pace_optim.estimate.derivatives import Jacobian, stencil
 from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty
 from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, least_squares
+from pace_optim.problem.drive_steps import of_joints
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 
@@ -62,7 +63,6 @@ def check_consistency(
     """Fit each training recording alone, from the joint result, and compare beyond the error bars.
 
     Args:
-        x: Its result, normalised (size,).
         score: Its score [rad²].
         there: Residuals and derivatives at x on the training samples; ``None``: they are simulated.
     """
@@ -107,14 +107,13 @@ class _Fit:
 def _fit_from(problem: Problem, x: torch.Tensor, there: Jacobian | None = None) -> _Fit:
     """Least squares from x, where the derivatives may be known."""
     evaluator = problem.training_evaluator()
-    colouring = colour(problem.space, problem.trees, problem.joint_names)
     start = Descent(x=x.clamp(-1.0, 1.0).clone())
     if there is not None:
         start.jacobian, (start.hessian, start.gradient) = there, there.normal_equations()
         start.scores = [float(there.residuals.score[0])]
     cfg = replace(_REFINE, noise_score=noise_score(problem))
-    best = least_squares(evaluator, colouring, [start], cfg)[0]
-    known = assess(problem, evaluator, colouring, best.x, ended=best, training=evaluator)
+    best = least_squares(evaluator, [start], cfg)[0]
+    known = assess(problem, evaluator, best.x, ended=best, training=evaluator)
     score = float(known.jacobian.residuals.score[0])
     return _Fit(score=score, x=known.x, uncertainty=known.uncertainty, simulated_steps=evaluator.simulated_steps)
 
@@ -224,9 +223,7 @@ def _nominal_gain(problem: Problem, r: int, field_name: str) -> torch.Tensor:
     if stated is not None:
         return torch.as_tensor(stated, dtype=torch.float64)
     env = problem.make_env(1)
-    result = torch.zeros(len(problem.joint_names), dtype=torch.float64)
-    for actuator in env.scene["robot"].actuators.values():
-        result[actuator.joint_indices] = getattr(actuator, field_name)[0]
+    result = torch.from_numpy(of_joints(env, field_name))
     env.close()
     return result
 
@@ -242,11 +239,10 @@ def _by_promise(problem: Problem, x: torch.Tensor) -> tuple[list[int], int]:
     """
     problem, x = _with_gains(problem, x, range(problem.dataset.num_recordings))
     evaluator = problem.training_evaluator()
-    colouring = colour(problem.space, problem.trees, problem.joint_names)
-    around = stencil(x, colouring)
+    around = stencil(x, evaluator.colouring)
     there = around.jacobian(evaluator.residuals(problem.space.to_physical(torch.cat([x[None], around.vectors]))))
     gains = {problem.space.slices[name].start for name in _GAINS.values()}
-    rows = [c for c, entries in enumerate(colouring.colours) if gains & set(entries)]
+    rows = sorted({evaluator.colouring.row_of[entry] for entry in gains})
     falls = []
     for r in range(problem.dataset.num_recordings):
         columns = there.columns.clone()

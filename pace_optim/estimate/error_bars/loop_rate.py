@@ -100,11 +100,7 @@ class LoopRates:
         return np.sqrt(self.weights)[:, None] * (self.values - self.value_at(self.chosen))
 
     def at(self, space: ParameterSpace, physical: np.ndarray) -> LoopRates:
-        """The same about a result: the chosen period's values are the result's, and the others' as far away as here.
-
-        Args:
-            physical: The result, (size,).
-        """
+        """The same about a result: the chosen period's values are the result's, and the others' as far away as here."""
         moved = self.values + (physical - self.value_at(self.chosen))
         return replace(self, values=np.clip(moved, space.lower.numpy(), space.upper.numpy()))
 
@@ -171,7 +167,6 @@ def loop_rates(
 
     Args:
         problem: What was fitted, with loops of an assumed rate.
-        x: The result, normalised (size,).
         there: Its residuals, and derivatives there, on the training samples.
         known: Which parameters have an error bar, (size,) bool; the others stay.
         phases: What the residuals have taken out of free phases.
@@ -253,7 +248,7 @@ def _refitted(
     x, near, is_end = by_chords(evaluator, x, replace(there, residuals=begin), _LEFT)
     if not is_end:
         hessian, _ = near.normal_equations()
-        x = least_squares(evaluator, there.colouring, [Descent(x=x, hessian=hessian)], _REFIT)[0].x
+        x = least_squares(evaluator, [Descent(x=x, hessian=hessian)], _REFIT)[0].x
         near = replace(near, residuals=evaluator.residuals(space.to_physical(x)[None]))
     residuals = near.residuals
     return _Refit(x=x, score=float(residuals.score), values=space.to_physical(x).numpy(), error=residuals.error[0])
@@ -270,7 +265,6 @@ def _against(errors: torch.Tensor, weights: np.ndarray, where: torch.Tensor, noi
     Args:
         errors: Residuals at the simulated periods, (m, K, R, n).
         weights: Of these in each candidate's, (candidates, m).
-        where: Which samples there are, (K, R) bool.
         noise: Sum of squares that the noise alone leaves [rad²].
     """
     series = [

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from scipy import signal
 
-from pace_optim.estimate.derivatives import Colouring, Jacobian
+from pace_optim.estimate.derivatives import Jacobian
 from pace_optim.problem.evaluator import Residuals
-from pace_optim.problem.parameter_space import ParameterSpace
+from pace_optim.problem.parameter_space import Colouring, ParameterSpace
 from pace_optim.recording.dataset import Torques
 
 AT_BOUND = 1e-3
@@ -94,7 +94,6 @@ def estimate_uncertainty(
     Of a walking robot's swings, Σ is known (:mod:`pace_optim.estimate.error_bars.assessment`).
 
     Args:
-        x: The optimum, normalised (size,).
         initial: Derivatives of the residuals by the first positions of ``initial_joints``, (sets, K, R, n).
         initial_joints: Joints whose first position was moved together.
         held: Labels of what is held where it is; it has no error bar, and the others have those beside it.
@@ -124,7 +123,6 @@ def uncertainty_of(
     Args:
         hessian: H = JᵀJ, normalised (size, size) [rad²].
         middle: JᵀΣJ, normalised (size, size) [rad⁴].
-        x: The optimum, normalised (size,).
         held: Labels of what is held where it is.
     """
     size = space.size
@@ -189,15 +187,14 @@ def inverse_of(hessian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _middle(jacobian: Jacobian) -> np.ndarray:
     """JᵀΣJ, (size, size)."""
     residuals, colouring = jacobian.residuals, jacobian.colouring
-    size, row = len(colouring.joints), _row_of(colouring)
-    total = np.zeros((size, size))
+    total = np.zeros((len(colouring.joints), len(colouring.joints)))
     for r in range(residuals.where.shape[1]):
         at = residuals.where[:, r]
         if not bool(at.any()):
             continue
         for joint in range(residuals.error.shape[-1]):
-            own = [entry for entry in row if joint in colouring.joints[entry]]
-            columns = jacobian.columns[[row[entry] for entry in own]][:, at, r, joint].numpy()
+            own = colouring.moving([joint])
+            columns = jacobian.columns[[colouring.row_of[entry] for entry in own]][:, at, r, joint].numpy()
             error = residuals.error[0, at, r, joint].numpy()
             total[np.ix_(own, own)] += columns @ filtered(columns, autocovariance(error)).T
     return total
@@ -208,10 +205,10 @@ def _from_first_sample(
 ) -> np.ndarray:
     """JᵀSSᵀJ σ², S the derivative by a joint's first position and σ² the variance of its samples' white noise."""
     residuals, colouring = jacobian.residuals, jacobian.colouring
-    size, row = len(colouring.joints), _row_of(colouring)
-    total = np.zeros((size, size))
+    total = np.zeros((len(colouring.joints), len(colouring.joints)))
     for tree in dict.fromkeys(_tree_of(joint, colouring) for joints in initial_joints for joint in joints):
-        own = [entry for entry in row if set(tree) & set(colouring.joints[entry])]
+        own = colouring.moving(tree)
+        rows = [colouring.row_of[entry] for entry in own]
         sets = [(i, joint) for i, joints in enumerate(initial_joints) for joint in joints if joint in tree]
         for r in range(residuals.num_recordings):
             at = residuals.where[:, r]
@@ -219,7 +216,7 @@ def _from_first_sample(
                 continue
             effect = np.zeros((len(own), len(sets)))
             for column, joint in itertools.product(residuals.columns_of(r), tree):
-                columns = jacobian.columns[[row[entry] for entry in own], :, column, joint]
+                columns = jacobian.columns[rows, :, column, joint]
                 effect += (columns @ initial[[i for i, _ in sets], :, column, joint].T).numpy()
             error = residuals.error[0, at, r][:, [joint for _, joint in sets]]
             effect *= (0.5 * error.diff(dim=0).square().mean(dim=0)).sqrt().numpy()
@@ -230,11 +227,6 @@ def _from_first_sample(
 def _tree_of(joint: int, colouring: Colouring) -> tuple[int, ...]:
     """What a joint moves: the joints of the entries that move it and not all joints."""
     return min((moved for moved in colouring.joints if joint in moved), key=len, default=())
-
-
-def _row_of(colouring: Colouring) -> dict[int, int]:
-    """The Jacobian's row of each entry that is not fixed."""
-    return {entry: c for c, entries in enumerate(colouring.colours) for entry in entries}
 
 
 def autocovariance(error: np.ndarray) -> np.ndarray:

@@ -14,19 +14,13 @@ from pace_actuators.base_parameters import CARRIED, PER_JOINT
 from pace_actuators.effects import effect_cfgs
 from pace_actuators.text import plural
 from pace_envs.tasks.pace import GLOBAL
-from pace_optim.estimate.derivatives import Jacobian, colour
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
 from pace_optim.estimate.error_bars.uncertainty import (
     HARDLY_KNOWN,
     SURE,
     Uncertainty,
-    autocovariance,
-    filtered,
-    inverse_of,
 )
 from pace_optim.estimate.least_squares import LeastSquaresCfg, least_squares
-from pace_optim.problem.evaluator import Residuals
-from pace_optim.problem.free_phases import FreePhases
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 from pace_optim.terminal.choices import UNKNOWN_FACTS
@@ -79,7 +73,6 @@ def undetermined(problem: Problem, x: torch.Tensor, uncertainty: Uncertainty, fa
     An encoder bias is open if others compensate for it exactly, such as the phase of a ripple on an unloaded joint.
 
     Args:
-        x: The result, normalised (size,).
         far: Whether the fit ended so far above the noise that error bars mean nothing: then they leave nothing open.
     """
     silent = set(uncertainty.no_influence)
@@ -127,7 +120,6 @@ def held_at_prior(
     are, and where that costs too much, only what has no influence.
 
     Args:
-        x: The result, normalised (size,).
         cfg: How the rest is fitted; ``None`` holds only what has no influence.
     """
     silent = [label for label in labels if label in uncertainty.no_influence]
@@ -158,7 +150,6 @@ def without_delay(
     the delay is inertia, kp times it viscous friction.
 
     Args:
-        x: The result, normalised (size,).
         held: Labels of what is held at its prior already.
     """
     space = problem.space
@@ -173,22 +164,18 @@ def _fitted_beside(problem: Problem, x: torch.Tensor, labels: list[str], cfg: Le
     """The vector with some entries at their prior and the rest fitted again; ``None`` where it is not as good."""
     physical = problem.space.to_physical(at_prior(problem, x, labels))
     held = replace(problem, space=problem.space.holding(labels, physical))
-    evaluator, colouring = held.training_evaluator(), colour(held.space, held.trees, held.joint_names)
+    evaluator = held.training_evaluator()
     tolerance = min(cfg.score_tolerance, AS_GOOD)  # as finely as it is judged
     cfg = replace(cfg, score_tolerance=tolerance, noise_score=noise_score(problem))
     before = float(evaluator.residuals(problem.space.to_physical(x)[None]).score[0])
-    best = least_squares(evaluator, colouring, [held.space.to_normalised(physical)], cfg)[0]
+    best = least_squares(evaluator, [held.space.to_normalised(physical)], cfg)[0]
     if best.score > (1 + AS_GOOD) * before:
         return None
     return problem.space.to_normalised(held.space.to_physical(best.x))
 
 
 def at_prior(problem: Problem, x: torch.Tensor, labels: list[str]) -> torch.Tensor:
-    """A normalised vector (size,) with some entries at their prior.
-
-    Args:
-        x: Normalised, (size,).
-    """
+    """A normalised vector (size,) with some entries at their prior."""
     space = problem.space
     at = [space.labels.index(label) for label in labels]
     result = x.clone()
@@ -220,72 +207,3 @@ def prior(problem: Problem) -> torch.Tensor:
                 null = parameter.start if parameter.null is None else parameter.null
                 result[here] = null if math.isfinite(null) else parameter.upper
     return result
-
-
-FINER = 4
-"""A step this many times finer stands for none: what is left then is a third of what changes (an error of first order,
-as that of friction that turns within a step, whatever the integrator)."""
-TO_NO_STEP = FINER / (FINER - 1)
-
-
-def change_without_step(
-    problem: Problem, physical: torch.Tensor, there: Residuals, phases: FreePhases | None = None
-) -> torch.Tensor | None:
-    """How the motion would change if the physics had no step, on the training samples, (K, R, n) [rad].
-
-    Args:
-        physical: The result, (size,).
-        phases: What these have taken out of free phases.
-
-    Returns:
-        The change; ``None`` where the finer simulation diverges.
-    """
-    finer = problem.with_physics_dt(problem.physics_dt / FINER)
-    evaluator = finer.training_evaluator()
-    evaluator.phases = phases
-    change = TO_NO_STEP * (evaluator.residuals(physical[None]).error[0] - there.error[0])
-    return change if bool(change.isfinite().all()) else None
-
-
-def step_share(
-    there: Jacobian, change: torch.Tensor, space: ParameterSpace, x: torch.Tensor, known: np.ndarray
-) -> np.ndarray:
-    """The part of each value that comes from the step, physical (size,): the value less that of a fit without a step.
-
-    The residuals r at the result change by c when the step goes, and the result moves, in the linear map of its error
-    bars, by - (JᵀJ)⁻¹ Jᵀ c. It does so only if the recording has no such step in it: what no parameter makes up for,
-    c' = c + J times that move, then stands in the residuals, r = - c' + noise. A recording that this very step made has
-    nothing of it. The share of c' that the residuals hold, α = - r c' / c' c', separates the two cases.
-
-    Args:
-        there: At the result, on the training samples.
-        change: Of the residuals when the step goes, (K, R, n) [rad].
-        x: The result, normalised (size,).
-        known: Which parameters have an error bar, (size,) bool; the others stay.
-    """
-    result = np.where(known, 0.0, np.nan)
-    free = np.flatnonzero(known)
-    if not len(free):
-        return result
-    hessian, _ = there.normal_equations()
-    inverse, _ = inverse_of(hessian.numpy()[np.ix_(free, free)])
-    move = torch.zeros(space.size, dtype=torch.float64)
-    move[free] = torch.from_numpy(-inverse @ there.transposed_times(change).numpy()[free])
-    if not _has_no_step(there, change + there.times(move)):
-        return result
-    result[free] = -(move * space.slope(x)).numpy()[free]
-    return result
-
-
-def _has_no_step(there: Jacobian, left: torch.Tensor) -> bool:
-    """Whether the recording may be of physics without the step: not if less than half of c' is surely in r."""
-    residuals, total = there.residuals, float(left.square().sum())
-    if total == 0:
-        return False
-    part, variance = -float((residuals.error[0] * left).sum()) / total, 0.0
-    for r in range(residuals.where.shape[1]):
-        at = residuals.where[:, r]
-        for joint in range(left.shape[-1]) if bool(at.any()) else ():
-            own, error = left[None, at, r, joint].numpy(), residuals.error[0, at, r, joint].numpy()
-            variance += float((own * filtered(own, autocovariance(error))).sum())
-    return part + SURE * np.sqrt(max(variance, 0.0)) / total > 0.5

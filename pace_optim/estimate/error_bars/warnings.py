@@ -13,10 +13,10 @@ from pace_actuators.text import conjoined
 from pace_envs.link_inertia import NAMES
 from pace_envs.tasks.pace import GLOBAL
 from pace_optim.estimate.error_bars.far_from_noise import FAR_ABOVE_NOISE, times_noise
+from pace_optim.estimate.error_bars.physics_step import step_error
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty
 from pace_optim.estimate.least_squares import ROUGH
 from pace_optim.problem.problem import Problem
-from pace_optim.problem.step_error import step_error
 
 _BY_EFFECT = (1, 19, 3, 2, 4, 5, 17, 18, 8, 7, 6, 9, 10, 11, 12, 13, 15)
 """Codes of warnings: first those of a result that is wrong, then of single values, last of a loss of accuracy."""
@@ -50,7 +50,6 @@ def fit_warnings(
     """Plain sentences, one for each kind; none if all is well.
 
     Args:
-        physical: The result, (size,).
         rmse: Errors as in ``result.json``.
         left_open: Labels of parameters that the recordings do not determine, at their prior.
         unsure: Labels of those that are not determined either, but fit worse there.

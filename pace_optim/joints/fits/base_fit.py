@@ -12,8 +12,7 @@ from pace_actuators.effects import Effect, EffectCfg
 from pace_optim.joints.fits.fits import Fits
 from pace_optim.joints.fits.fitted import Fitted
 from pace_optim.joints.fits.fitting_cfg import DEFAULT, FittingCfg
-from pace_optim.joints.fits.labels import found_effects
-from pace_optim.joints.fits.model import BASE, COLUMN, JointModel, whole_values
+from pace_optim.joints.fits.model import BASE, COLUMN, JointModel, found_effects, whole_values
 from pace_optim.joints.simulation import ReferencePath, measured_path, reference_path, twin_problem
 from pace_optim.joints.simulation.problem import TwinProblem
 from pace_optim.problem.problem import Problem
@@ -30,11 +29,9 @@ def fit_base(
     """Fit the base model from a first guess; the reference that the joints move along follows.
 
     Args:
-        fits: Fits models.
         problem: The whole robot, without effects.
         physical: First guess of its parameters, (size,).
         effects: Effects whose influence on the rigid bodies is wanted.
-        say: Shows how far it is.
         own: Effects with values that the base model has too.
 
     Returns:
@@ -63,12 +60,9 @@ def _fit_along(
     """The joints along a reference that follows the model, and the model fitted there.
 
     Args:
-        fits: Fits models.
-        problem: The whole robot.
         fitted: Where to begin.
         along: Makes the reference: ``measured_path`` or ``reference_path``.
         model_effects: Effects whose influence on the rigid bodies is wanted.
-        say: Shows how far it is.
     """
 
     def path(of: Problem, model_effects: Sequence[str] = ()) -> ReferencePath:

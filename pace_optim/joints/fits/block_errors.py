@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -49,10 +48,7 @@ def block_errors(
 
     Args:
         error: (T, R, n) at every control step.
-        where: Which samples count, (T, R) bool.
-        control_dt: [s].
         weight: What errors were multiplied by, (T, R, n), 0 where a joint is held; ``None``: 1.
-        cfg: How long blocks are.
     """
     if weight is not None:
         return _free_errors(error, where, weight, control_dt, cfg)
@@ -84,28 +80,20 @@ def _free_errors(
     return BlockErrors(square=square, weight=torch.ones(count, dtype=torch.float64))
 
 
-def _usual_time(samples: Sequence[int], control_dt: float) -> float:
-    """How long the median joint is free, of those that ever are [s]."""
-    return float(np.median([count for count in samples if count] or [0])) * control_dt
-
-
 def check_long_enough(
     where: torch.Tensor, control_dt: float, *, free: torch.Tensor | None = None, cfg: FittingCfg = DEFAULT
 ) -> None:
     """See that recordings are long enough to judge by.
 
     Args:
-        where: Which samples count, (T, R) bool.
-        control_dt: [s].
         free: Where joints are free, (T, R, n) bool; ``None``: everywhere.
-        cfg: How long they are.
 
     Raises:
         ValueError: If they are not.
     """
     if free is not None:
         samples = (free & where[..., None]).sum(dim=(0, 1)).tolist()
-        usual = _usual_time(samples, control_dt)
+        usual = float(np.median([count for count in samples if count] or [0])) * control_dt
         if usual < (least := cfg.blocks * cfg.swing_s):
             raise ValueError(
                 f"In the held-out data, the median joint swings for {usual:.2g} s, too short to judge a model by. "
@@ -120,14 +108,10 @@ def check_long_enough(
         )
 
 
-def _block_length(where: torch.Tensor, control_dt: float, cfg: FittingCfg) -> float:
-    """[s]."""
-    return min(cfg.block_s, max(cfg.shortest_s, sum(_spans(where)) * control_dt / cfg.blocks))
-
-
 def _blocks(where: torch.Tensor, control_dt: float, cfg: FittingCfg) -> list[tuple[int, torch.Tensor]]:
     """Recordings and samples of blocks: of time, so that coarse sampling has the same ones."""
-    steps = max(1, round(_block_length(where, control_dt, cfg) / control_dt))
+    length = min(cfg.block_s, max(cfg.shortest_s, sum(_spans(where)) * control_dt / cfg.blocks))
+    steps = max(1, round(length / control_dt))
     blocks = []
     for r in range(where.shape[1]):
         at = where[:, r].nonzero()[:, 0]

@@ -17,8 +17,6 @@ from pace_optim.estimate.levenberg_marquardt import (
     FIRST_DAMPING,
     LinearModel,
     next_damping,
-    rows_of,
-    trial_rows,
 )
 from pace_optim.joints.fits.block_errors import BlockErrors, block_errors
 from pace_optim.joints.fits.fitted import Fitted
@@ -34,19 +32,17 @@ TRIALS = DAMPING_TRIALS[:-1]
 class JointDescent:
     """One model's descent: rows are the favoured step, its neighbours for the next Jacobian, and the other trials.
 
-    In a neighbour every joint has another one of its free entries moved, so that there are as many as a joint has, and
-    not as many as all joints have together.
+    Where the favoured step wins, the next derivatives are already known. In a neighbour every joint has another one of
+    its free entries moved, so that there are as many as a joint has, and not as many as all joints have together.
     """
 
     def __init__(self, start: Fitted, samples: torch.Tensor, keep: bool, rough: bool, cfg: FittingCfg):
         """Begin at the model's x.
 
         Args:
-            start: The model.
             samples: How many count for each joint, (n,).
             keep: Whether the last Jacobian is kept.
             rough: Whether derivatives are taken over wide steps first.
-            cfg: Steps and tolerances.
         """
         self._cfg = cfg
         self.model, self.tried, self._samples, self._keep = start.model, start.tried, samples, keep
@@ -86,13 +82,13 @@ class JointDescent:
         neighbours = favoured.repeat(self._gradient.shape[1], 1, 1)
         for j, at in enumerate(self._free):
             neighbours[torch.arange(len(at)), j, at] += self._step[j, at]
-        return rows_of(trials, neighbours)
+        return torch.cat([trials[:1], neighbours, trials[1:]])
 
     def tell(self, x: torch.Tensor, error: torch.Tensor) -> None:
         """Take the best row of each joint."""
         size = self.x.shape[1]
         scores = error.square().sum(dim=(1, 2), dtype=torch.float64).cpu() / self._samples
-        choice = trial_rows(len(x), len(TRIALS))
+        choice = [0, *range(len(x) - len(TRIALS) + 1, len(x))]  # the trials, the favoured first
         best = scores[choice].argmin(dim=0)
         lowest = scores[choice].gather(0, best[None])[0]
         better = lowest < self.score
@@ -222,7 +218,6 @@ class Fits:
         Models that the control step shows to be far behind the best one on every joint stay where it left them.
 
         Args:
-            problem: The joints simulated alone.
             starts: Models and where they start.
             rough: Whether to go on over wide steps where narrow ones have led.
         """
@@ -242,8 +237,6 @@ class Fits:
         """A model fitted in windows over wide steps, where narrow ones may lead no further.
 
         Args:
-            problem: The joints simulated alone.
-            now: The model.
             kept: Which windows that are trained on count for which joints, (R, n) bool; all if not given.
         """
         return self.side_by_side(problem.in_windows(), [now], self.cfg.coarse, rough=True, kept=kept)[0]
@@ -297,7 +290,6 @@ class Fits:
         with more damping. Joints do not influence each other, so that one row serves all of them.
 
         Args:
-            problem: The joints simulated alone.
             starts: Models and where they start.
             max_iteration: Largest number of iterations.
             keep_jacobian: Whether the last Jacobian is kept.
@@ -341,8 +333,6 @@ class Fits:
         """Fit models of all joints on some of them, and their errors; the others stay as they are, and cost nothing.
 
         Args:
-            problem: All joints.
-            starts: The models.
             joints: Which are fitted, (n,) bool.
             errors: What the other joints' errors are.
         """
@@ -360,8 +350,6 @@ class Fits:
         Rousseeuw 1984, least median of squares regression).
 
         Args:
-            problem: The joints simulated alone.
-            now: The model.
             joints: Which of them are fitted so, (n,) bool; for the others all windows count.
         """
         cfg = self.cfg

@@ -78,7 +78,6 @@ class Fitted:
         """The same with some joints, (n,) bool, as another fit has them; derivatives stay where no effect comes along.
 
         Args:
-            joints: Which joints.
             own: Of these joints alone, or of all.
         """
         if bool(joints.all()):

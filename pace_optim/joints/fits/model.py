@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from pace_actuators.base_parameters import BASE_PARAMETERS
-from pace_actuators.effects import PROBED_STIFFNESS, Effect, EffectParameter
+from pace_actuators.effects import PROBED_STIFFNESS, Effect, EffectCfg, EffectParameter
 from pace_optim.estimate.error_bars.uncertainty import AT_BOUND
 from pace_optim.problem.parameter_space import Box
 from pace_optim.problem.problem import Problem
@@ -178,8 +178,6 @@ class JointModel:
         """The same with an effect on some more joints, and the physical values (n, P) with those of the effect.
 
         Args:
-            physical: Of this model, (n, P).
-            effect: The effect.
             joints: Which joints get it, (n,) bool.
             values: Of the effect, (n, parameters).
         """
@@ -230,12 +228,7 @@ class JointModel:
         return has & ((self.lower[:, columns] < least) | (self.upper[:, columns] > most)).any(dim=1)
 
     def structure_held(self, effect: type[Effect], physical: torch.Tensor) -> JointModel:
-        """Fix the discrete parameter of an effect: it cannot be optimized by gradients.
-
-        Args:
-            effect: The effect.
-            physical: Of this model, (n, P).
-        """
+        """Fix the discrete parameter of an effect: it cannot be optimized by gradients."""
         if not effect.structural:
             return self
         return self.held(effect, [effect.structural], physical)
@@ -244,9 +237,7 @@ class JointModel:
         """The same with parameters of an effect held where they are, on the joints that have it.
 
         Args:
-            effect: The effect.
             names: Its parameters.
-            physical: Of this model, (n, P).
         """
         has, start = self.has[self.effects.index(effect)], self.columns(effect).start
         lower, upper = self.lower.clone(), self.upper.clone()
@@ -349,3 +340,32 @@ def whole_values(model: JointModel, x: torch.Tensor, names: Sequence[str]) -> di
             else:
                 values[key] = {n: float(own[j, k]) for j, n in enumerate(names) if bool(has[j])}
     return values
+
+
+def found_effects(model: JointModel, joint_names: Sequence[str], order: Sequence[type[Effect]] = ()) -> list[EffectCfg]:
+    """The effects that joints have.
+
+    Args:
+        model: The model that has them.
+        order: Which comes first; none keeps the model's order.
+    """
+    result = []
+    for effect in order or model.effects:
+        has = model.has[model.effects.index(effect)]
+        own = [name for name, yes in zip(joint_names, has.tolist(), strict=True) if yes]
+        if not own:
+            continue
+        everywhere = len(own) == len(joint_names)
+        cfg = EffectCfg(
+            effect=effect.name,
+            joint_names_expr=".*" if effect.shared or everywhere else "|".join(own),
+            shared=effect.shared or effect in model.shared,
+            wide=bool(model.is_wide(effect).any()),
+        )
+        result.append(cfg)
+    return result
+
+
+def labels(model: JointModel, joint_names: Sequence[str], order: Sequence[type[Effect]] = ()) -> list[str]:
+    """The same as ``fit.py --effects`` takes them."""
+    return [cfg.label for cfg in found_effects(model, joint_names, order)]

@@ -46,7 +46,6 @@ class SideBySide:
 
         Args:
             problem: The joints simulated alone; its own effects are not used.
-            slots: The models.
             training: Whether only recordings that are trained on are simulated.
             compiler: Compiles kernels that simulate; without one the drives themselves do, on the processor.
             device: Where kernels run; errors stay there.
@@ -76,7 +75,6 @@ class SideBySide:
 
         Args:
             physical: For each slot (rows, n, P).
-            where: Which samples count, (T, R) bool.
             stride: Only every so many steps.
 
         Returns:

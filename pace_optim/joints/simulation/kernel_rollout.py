@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import contextlib
-import math
+import copy
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 
+from pace_actuators import PaceDCMotor
 from pace_envs.compiled_drive.drive_code import Program
 from pace_envs.compiled_drive.joint_source import joint_source
-from pace_envs.compiled_drive.one_joint import HELD, commands
+from pace_envs.compiled_drive.one_joint import HELD, OneJoint, commands, position_term
 from pace_envs.compiler import Compiler
-from pace_optim.joints.simulation.kernel_recorder import record
+from pace_optim.joints.simulation.simulation import TwinSimulation
 from pace_optim.problem.rollout import between_steps
 
 if TYPE_CHECKING:
@@ -52,8 +53,6 @@ class KernelRollout:
         Args:
             rollout: Of joints that are simulated alone, on the processor.
             parts: All its environments; in those of a part the same effects act.
-            compiler: Compiles kernels.
-            device: Where they run.
         """
         self._rollout, self._parts, self._compiler, self._device = rollout, list(parts), compiler, device
         self._groups: list[_Group] = []
@@ -75,12 +74,8 @@ class KernelRollout:
         """
         rollout = self._rollout
         num_envs, n = rollout.env.num_envs, rollout.robot.num_joints
-        steps = int(at[-1]) + 1
-        lag, offset = rollout.observation_lag(rollout.duration_steps), rollout.dataset.sample_offset
-        if lag is None and offset is not None:
-            lag = torch.zeros(2, num_envs, n, dtype=torch.float64)
-        most = 0.0 if offset is None else float(offset.abs().max())
-        ahead = 0 if lag is None else max(0, math.ceil(most - float(lag.min()))) + 2
+        steps, reading = int(at[-1]) + 1, rollout.reading(rollout.duration_steps)
+        ahead = 0 if reading is None else reading.ahead
         rollout.hold(0)
         first = rollout.robot.sensed_joint_pos().clone()
         result = torch.empty(len(at), num_envs, n, dtype=torch.float64, device=self._device)
@@ -89,7 +84,9 @@ class KernelRollout:
             return result
         rollout.advance(0)
         self._record()
-        late = [lag is not None and (offset is not None or bool(lag[:, g.rows].any())) for g in self._groups]
+        of_late = set() if reading is None else set(reading.late.tolist())
+        late = [not of_late.isdisjoint(group.rows) for group in self._groups]
+        reading = None if reading is None else reading.to(self._device)
         wanted = at.to(self._device, torch.int32)
         whole = torch.arange(steps + ahead, dtype=torch.int32, device=self._device)
         own, every = _slots(wanted, steps), _slots(whole, steps + ahead)
@@ -120,21 +117,15 @@ class KernelRollout:
             begin = shown[rows][:, columns]
             seen = out.view(len(out), *begin.shape)
             if is_late:
-                assert lag is not None
+                assert reading is not None
                 seen[0] = begin
-                own_lag = lag[:, rows][..., group.program.columns].to(self._device)
-                when = _when(wanted, own_lag, rollout.duration_steps)
-                if offset is not None:
-                    recording = torch.arange(group.rows.start, group.rows.stop) % rollout.dataset.num_recordings
-                    when = when + offset[at][:, recording, None].to(self._device)
-                seen = between_steps(seen, when)
+                envs = torch.arange(rows.start, rows.stop, device=self._device)
+                seen = between_steps(seen, reading.taken_at(wanted, envs)[..., columns])
             elif int(at[0]) == 0:
                 seen[0] = begin
             result[:, rows, columns] = seen
         rollout.simulated_steps += (steps - 1) * num_envs
         return result
-
-    # ------------------------------------------------------------------ inside
 
     def _record(self) -> None:
         """Record the control step, unless it has been recorded with the same branches."""
@@ -145,7 +136,7 @@ class KernelRollout:
         n, recordings = self._rollout.robot.num_joints, self._rollout.dataset.num_recordings
         for actuator in list(self._rollout.robot.actuators.values()):
             for rows in self._parts:
-                program = record(self._rollout, actuator, rows)
+                program = _recorded(self._rollout, actuator, rows)
                 source, leaves = joint_source(program)
                 recording = torch.arange(rows.start, rows.stop) % recordings
                 place = (recording[:, None] * n + program.columns).reshape(-1).to(self._device, torch.int32)
@@ -206,14 +197,82 @@ def _lengthened(values: torch.Tensor, steps: int) -> torch.Tensor:
     return torch.cat([values, values[-1:].expand(steps - len(values), -1)])
 
 
-def _when(at: torch.Tensor, lag: torch.Tensor, steps: int) -> torch.Tensor:
-    """At which control step samples were taken, (K, m, n).
+def _recorded(rollout: Rollout, actuator: PaceDCMotor, rows: range) -> Program:
+    """What a control step does to joints of a drive in some rows, in all of which the same effects act.
 
     Args:
-        at: The steps that they are stamped with, (K,).
-        lag: Of the first and the last sample [control steps], (2, m, n).
-        steps: Control steps of the rollout.
+        rollout: Of joints that are simulated alone; it has begun with a control step.
+        actuator: One of its robot's drives.
+
+    Raises:
+        NotTraceableError: If a kernel cannot do it, such as an effect that branches over a tensor's values.
     """
-    rate = (lag[1] - lag[0]) / max(1, steps - 1)
-    k = at.double()[:, None, None]
-    return k - (lag[0] + rate * k)
+    position_term(rollout.env)
+    joint = OneJoint(rollout.robot, actuator, rows)
+    with torch.inference_mode(False):
+        sim = _simulation(joint, cast(TwinSimulation, rollout.env.sim))
+    with joint.noting():
+        robot = joint.in_robot(sim, rollout.dataset)
+
+        def hold() -> None:
+            for field, held in zip((sim.qpos, sim.qvel), joint.held(joint.drive.encoder_bias), strict=True):
+                sim._set(field, held)
+            robot._refresh()
+
+        is_held = rollout.dataset.carried is not None
+        shown = joint.control_step(rollout.env.cfg.decimation, rollout.dataset, hold=hold if is_held else None)
+        return joint.program(shown)
+
+
+def _simulation(joint: OneJoint, true: TwinSimulation) -> Any:
+    """The simulation of one joint."""
+    sim, columns = copy.copy(true), joint.dof_columns
+    own, alone = vars(sim), true._stands_alone[columns].double().expand(1, len(joint.rows), -1)
+    own |= {"num_envs": 1, "_as_in_model": True, "_shape": (1, 1), "_columns": torch.tensor([0])}
+    own |= {"_felt": None, "_steps": 0, "path": _Path(joint, list(true._model_values))}
+    softness = () if true.friction_time is None else ("friction_time", "_rate", "_softness", "_rest_inertia")
+    for key in ("qpos", "qvel", "qfrc_applied", "_implicit", *softness):
+        joint.replace(own, vars(true), key, columns=columns)
+    for key, values, places in (
+        ("_expanded", true._expanded, columns),
+        ("_model_values", true._model_values, true._place(columns)),
+    ):
+        own[key] = dict(values)
+        for name in values:
+            joint.replace(own[key], values, name, columns=places)
+    own["_stands_alone"] = joint.leaf(lambda: alone, "bool")
+    for key in ("inertia", "torque", "stiffness"):
+        own[f"_{key}"] = _Series(joint, key)
+    for key in ("middle", "begin", "load"):
+        own[f"_{key}"] = [_Series(joint, f"{key}.{part}") for part in range(true._steps_per_interval)]
+    return sim
+
+
+class _Series:
+    """Values by control step: the present one."""
+
+    def __init__(self, joint: OneJoint, name: str):
+        """Of a name."""
+        self._joint, self._name = joint, name
+
+    def __getitem__(self, step: int) -> torch.Tensor:
+        """At the present step."""
+        return self._joint.series(self._name)
+
+
+class _Path:
+    """What effects on the model change of what joints feel."""
+
+    def __init__(self, joint: OneJoint, keys: list[tuple[str, str]]):
+        """Of some effects' parameters."""
+        self.model_effects = {key: _Change(joint, ".".join(key)) for key in keys}
+
+
+class _Change:
+    """Per unit of one parameter."""
+
+    def __init__(self, joint: OneJoint, name: str):
+        """Of a name."""
+        self.inertia, self.torque, self.load, self.stiffness = (
+            _Series(joint, f"{name}.{part}") for part in ("inertia", "torque", "load", "stiffness")
+        )

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
 import torch
-from scipy import fft, optimize
+from scipy import fft, ndimage, optimize
 
 from pace_actuators.effects import EffectCfg, effect_cfgs, get_effect, probe_points
 from pace_envs.tasks.pace import GLOBAL
-from pace_optim.joints.simulation.joint_load import JointLoad, Links, LoadChange, Motion, Parameter
-from pace_optim.joints.simulation.link_states import LinkChange
+from pace_optim.joints.simulation.joint_load import JointLoad, LinkChange, Links, Motion, Parameter
 from pace_optim.problem.free_phases import FreePhases
 from pace_optim.problem.problem import Problem
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import Dataset
-from pace_optim.recording.moving_base import Carried
 from pace_optim.recording.noise import noise_floor
 
 if TYPE_CHECKING:
@@ -47,7 +45,6 @@ def beside_simulation(dataset: Dataset, shown: torch.Tensor) -> torch.Tensor:
     """How far the robot was from its simulation at control steps, without the measurement's noise, (count, R, n) [rad].
 
     Args:
-        dataset: The recordings.
         shown: What encoders show in the simulation where there are samples, (count, R, n) [rad].
     """
     count = len(shown)
@@ -70,11 +67,9 @@ def _smooth_phases(error: torch.Tensor, free: torch.Tensor, recording: Recording
     """Smooth errors (T, n) in each free phase by itself; a joint that is held is where it was measured."""
     for j in range(error.shape[1]):
         noise = noise_floor(recording.dof_pos[:, j], dt).sigma
-        own = free[:, j].numpy().astype(int)
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], own, [0]])))
         error[:, j] *= free[:, j]
-        for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-            error[first:end, j] = torch.from_numpy(_smooth(error[first:end, j].numpy(), noise))
+        for (phase,) in ndimage.find_objects(ndimage.label(free[:, j].numpy())[0]):
+            error[phase, j] = torch.from_numpy(_smooth(error[phase, j].numpy(), noise))
 
 
 def _smooth(values: np.ndarray, noise: float) -> np.ndarray:
@@ -116,9 +111,7 @@ class ReferencePath:
     position: torch.Tensor
     """(T, R, n) [rad]."""
     feel: JointLoad
-    stiffness: torch.Tensor
-    """Derivative of the torque by the joint's own position, (T, R, n) [N m/rad]."""
-    model_effects: dict[tuple[str, str], LoadChange]
+    model_effects: dict[Parameter, JointLoad]
     """Change of what is felt per unit of an effect's parameter, by (effect, parameter)."""
     columns: torch.Tensor
     """The joints' degrees of freedom in the model, (n,)."""
@@ -193,7 +186,6 @@ class ReferencePath:
             rest_inertia=self.rest_inertia[recording],
             position=of(self.position, step),
             feel=self.feel.map(lambda each: of(each, intervals)),
-            stiffness=of(self.stiffness, intervals),
             model_effects={key: feel.map(lambda each: of(each, intervals)) for key, feel in self.model_effects.items()},
         )
 
@@ -202,7 +194,6 @@ class ReferencePath:
             self,
             position=self.position[index],
             feel=self.feel.map(lambda each: each[index]),
-            stiffness=self.stiffness[index],
             model_effects={key: feel.map(lambda each: each[index]) for key, feel in self.model_effects.items()},
             **changes,
         )
@@ -221,8 +212,6 @@ def reference_path(
     it is what they did, not what the candidate lets them do.
 
     Args:
-        problem: The problem; its own effects count too.
-        physical: The candidate's physical parameters, (size,).
         model_effects: Effects on the rigid-body model whose influence is wanted.
         late: Joints that are not taken there, (n,) bool: it may be their log that is late. ``None``: no joint.
         away: Nor are those that are further from it than this, RMS over a recording [rad]: gravity is not linear in
@@ -230,23 +219,18 @@ def reference_path(
     """
     problem, values = _on_all_joints(problem, physical, model_effects)
     rollout = _begun(problem, values)
-    moved: list[torch.Tensor] = []
-
-    def noted(steps: int) -> Iterable[torch.Tensor]:
-        shown, *moved[:] = rollout.motion(steps)
-        return shown
-
-    shown = torch.stack([each.clone() for _, each in rollout.samples(simulated=noted)])
-    positions, speeds = (each[: len(shown)].clone() for each in moved)
-    motion = positions, speeds
+    shown, positions, speeds = rollout.motion(rollout.duration_steps)
     if problem.joints_stand_alone:
-        return _along(problem, values, model_effects, rollout, *motion)
+        return _along(problem, values, model_effects, rollout, positions, speeds)
     beside = beside_simulation(problem.dataset, shown - _biases(problem, values))
-    share = 1.0 if problem.dataset.carried is None else _share_of_free(problem.dataset.carried, len(beside))
+    carried, share = problem.dataset.carried, torch.ones(())
+    if carried is not None:  # the part of the time in which each joint is free, (R, n)
+        share = carried.free[: len(beside)].double().mean(dim=0).clamp(min=1e-9)
     beside *= (beside.square().mean(dim=0, keepdim=True) / share).sqrt() <= away
     if late is not None:
         beside[..., late] = 0.0
-    return _along(problem, values, model_effects, rollout, *_taken(rollout, *motion, beside, problem.control_dt))
+    moved = _taken(rollout, positions, speeds, beside, problem.control_dt)
+    return _along(problem, values, model_effects, rollout, *moved)
 
 
 def measured_path(problem: Problem, physical: torch.Tensor, model_effects: Sequence[str] = ()) -> ReferencePath:
@@ -301,12 +285,14 @@ def _taken(
 
 def _begun(problem: Problem, values: dict[str, dict[str, float]]) -> Rollout:
     """One candidate at the beginning of all recordings."""
-    rollout, space = problem.evaluator().rollout(1), problem.space
-    own = {
-        p.name: {key: values[p.name][key] for key in p.keys} for p in space.parameters
-    }  # some mean nothing on slides
-    rollout.start(space.from_dict(own)[None], problem.dataset.sampled)
+    rollout = problem.evaluator().rollout(1)
+    rollout.start(_vector(problem, values)[None], problem.dataset.sampled)
     return rollout
+
+
+def _vector(problem: Problem, values: dict[str, dict[str, float]]) -> torch.Tensor:
+    """A candidate, physical (size,), without what means nothing on slides."""
+    return problem.space.from_dict({p.name: {k: values[p.name][k] for k in p.keys} for p in problem.space.parameters})
 
 
 def _along(
@@ -322,9 +308,7 @@ def _along(
     motion = Motion.between(positions, speeds, problem.control_dt, carried, problem.loop_dt)
     phases = None
     if carried is not None:
-        evaluator = problem.evaluator()
-        own = {p.name: {key: values[p.name][key] for key in p.keys} for p in problem.space.parameters}
-        phases = evaluator.free_phases(problem.space.from_dict(own)).of_single_joints()
+        phases = problem.evaluator().free_phases(_vector(problem, values)).of_single_joints()
     now = {
         (name, parameter.name): torch.tensor([*values[f"{name}.{parameter.name}"].values()], dtype=torch.float64)
         for name in model_effects
@@ -332,30 +316,22 @@ def _along(
     }
     links, changes = Links.of(rollout.env), {key: _link_change(rollout, *key, own) for key, own in now.items()}
     feel, felt = links.feel(motion, changes)
-    stiffness, stiffer = _stiffness(problem, links, motion, feel, felt, changes)
-    load_changes = {}
+    _add_stiffness(problem, links, motion, feel, felt, changes)
     for key, has in now.items():  # each twin has its own part of an effect itself; its neighbours' stays
-        change = load_changes[key] = LoadChange(**vars(felt[key]), stiffness=stiffer[key])
-        feel, stiffness = feel.less(change, has), stiffness - has * change.stiffness
+        feel = feel.less(felt[key], has)
     columns, sim = rollout.robot.dof_columns, rollout.env.sim
     rest_inertia = 1 / sim.friction_weights(columns) - sim.expand("dof_armature")[:, columns]
     rollout.env.close()
     return ReferencePath(
         position=positions[..., rollout.robot.qpos_columns],
         feel=feel,
-        stiffness=stiffness,
-        model_effects=load_changes,
+        model_effects=felt,
         columns=columns,
         rest_inertia=rest_inertia,
         names=tuple(rollout.robot.joint_names),
         control_dt=problem.control_dt,
         phases=phases,
     )
-
-
-def _share_of_free(carried: Carried, steps: int) -> torch.Tensor:
-    """In which part of the time each joint is free, (R, n)."""
-    return carried.free[:steps].double().mean(dim=0).clamp(min=1e-9)
 
 
 def _within_phases(values: torch.Tensor, slope: torch.Tensor, free: torch.Tensor, dt: float) -> torch.Tensor:
@@ -385,26 +361,23 @@ def _on_all_joints(
     return problem.with_effects([*others, *(EffectCfg(effect=effect) for effect in effects)]), values
 
 
-def _stiffness(
+def _add_stiffness(
     problem: Problem,
     links: Links,
     motion: Motion,
     feel: JointLoad,
     felt: Mapping[Parameter, JointLoad],
     changes: Mapping[Parameter, LinkChange],
-) -> tuple[torch.Tensor, dict[Parameter, torch.Tensor]]:
-    """Derivative of f_j - M_j a_j by each joint's own position, and how changes change it, (T, R, n) each."""
+) -> None:
+    """Write the derivative of f_j - M_j a_j by each joint's own position, and how changes change it."""
     steps, motion = len(motion.qpos), motion.every(_STIFFNESS_EVERY)
-    stiffness = torch.empty_like(feel.torque)
-    stiffer = {key: torch.empty_like(stiffness) for key in changes}
     for moved in _one_of_each_tree(problem):
         there, others = links.feel(motion.moved(links.shifts(motion, moved, _STEP)), changes)
-        every = [(stiffness, feel, there), *((stiffer[key], felt[key], others[key]) for key in changes)]
-        for result, here, each in every:
+        for here, each in ((feel, there), *((felt[key], others[key]) for key in changes)):
             before = here.map(lambda own: own[::_STIFFNESS_EVERY])
             change = each.torque - before.torque - (each.inertia - before.inertia) * motion.qacc[..., links.columns]
-            result[..., moved] = (change[..., moved] / _STEP).repeat_interleave(_STIFFNESS_EVERY, dim=0)[:steps]
-    return stiffness, stiffer
+            change = (change[..., moved] / _STEP).repeat_interleave(_STIFFNESS_EVERY, dim=0)
+            here.stiffness[..., moved] = change[:steps]
 
 
 def _one_of_each_tree(problem: Problem) -> Iterator[list[int]]:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 
 import torch
 
-from pace_actuators.effects import EffectCfg
 from pace_envs import ManagerBasedRLEnv
 from pace_optim.joints.simulation.path import ReferencePath
 from pace_optim.joints.simulation.simulation import TwinSimulation
@@ -40,16 +38,9 @@ class TwinProblem(Problem):
             return self
         places = joints.nonzero()[:, 0].tolist()
         cfg = self.plain_cfg.on_joints([self.joint_names[j] for j in places])
-        part = replace(self, plain_cfg=cfg, dataset=self.dataset.on_joints(places), path=self.path.on_joints(places))
+        trees, data = [self.trees[j] for j in places], self.dataset.on_joints(places)
+        part = replace(self, plain_cfg=cfg, trees=trees, dataset=data, path=self.path.on_joints(places))
         return part.with_effects(()).with_physics_dt(self.physics_dt)
-
-    def with_effects(self, effects: Sequence[EffectCfg | str]) -> TwinProblem:
-        """The same with other effects."""
-        return _with_path(super().with_effects(effects), self.path)
-
-    def with_physics_dt(self, physics_dt: float) -> TwinProblem:
-        """The same with another physics step [s]."""
-        return _with_path(super().with_physics_dt(physics_dt), self.path)
 
     def in_windows(self) -> TwinProblem:
         """The same with recordings cut into windows: some times as fast, to lead a fit, not to judge by."""
@@ -74,13 +65,10 @@ def twin_problem(problem: Problem, path: ReferencePath) -> TwinProblem:
     """The same recordings and parameters, each joint a separate tree.
 
     Args:
-        problem: The problem of the whole robot.
         path: A reference simulation on the same recordings.
     """
-    plain, cfg = problem.plain_cfg.of_driven_joints(), problem.env_cfg.of_driven_joints()
-    return _with_path(replace(problem, plain_cfg=plain, env_cfg=cfg), path)
-
-
-def _with_path(problem: Problem, path: ReferencePath) -> TwinProblem:
     content = {field.name: getattr(problem, field.name) for field in fields(Problem)}
-    return TwinProblem(**{**content, "trees": [[name] for name in problem.joint_names]}, path=path)
+    content["plain_cfg"] = problem.plain_cfg.of_driven_joints()
+    content["env_cfg"] = problem.env_cfg.of_driven_joints()
+    content["trees"] = [[name] for name in problem.joint_names]
+    return TwinProblem(**content, path=path)

@@ -33,10 +33,7 @@ class TwinSimulation(Simulation):
         """Set up the state.
 
         Args:
-            cfg: The configuration; the time step counts.
-            spec: The robot's model.
             num_envs: Number of environments, a multiple of the path's recordings.
-            path: The reference.
         """
         self.path = path
         super().__init__(cfg, spec, num_envs)
@@ -49,10 +46,10 @@ class TwinSimulation(Simulation):
         self._intervals = len(path.feel.torque)
         self._steps_per_interval = round(path.control_dt / cfg.dt)
         self._inertia, self._torque, self._stiffness = (
-            _OneByOne(self.series(name)) for name in ("inertia", "torque", "stiffness")
+            self.series(name) for name in ("inertia", "torque", "stiffness")
         )
         self._middle, self._begin, self._load = (
-            [_OneByOne(self._in_part(name, part)) for part in range(self._steps_per_interval)]
+            [self._in_part(name, part) for part in range(self._steps_per_interval)]
             for name in ("middle", "begin", "load")
         )
         self._model_values: dict[tuple[str, str], torch.Tensor] = {}
@@ -66,10 +63,8 @@ class TwinSimulation(Simulation):
             name: ``inertia``, ``torque`` or ``stiffness``; of a physics step of the interval, such as ``middle.1``,
                 ``middle``, ``begin`` or ``load``; of a model effect, ``<effect>.<parameter>.inertia`` and so on.
         """
-        if name in ("inertia", "torque"):
+        if name in ("inertia", "torque", "stiffness"):
             return getattr(self.path.feel, name)
-        if name == "stiffness":
-            return self.path.stiffness[: self._intervals]
         kind, _, rest = name.partition(".")
         if rest.isdigit():
             last = self._steps_per_interval - 1
@@ -273,23 +268,6 @@ class TwinSimulation(Simulation):
             field.copy_(value.view(field.shape))
         else:
             field[:, self._columns] = value.view(len(field), -1)
-
-
-class _OneByOne:
-    """One tensor an interval: taking them out of a list costs nothing at each step, making it pays after the first."""
-
-    def __init__(self, values: torch.Tensor):
-        """Of (T, …)."""
-        self._values = values
-        self._list: tuple[torch.Tensor, ...] = ()
-
-    def __getitem__(self, interval: int) -> torch.Tensor:
-        """Of an interval."""
-        if not self._list:
-            if interval == 0:
-                return self._values[0]
-            self._list = self._values.unbind()
-        return self._list[interval]
 
 
 def _between(at_instants: torch.Tensor, part: float) -> torch.Tensor:

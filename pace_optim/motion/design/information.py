@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from pace_optim.estimate.derivatives import NARROW, Colouring, colour, stencil
+from pace_optim.estimate.derivatives import NARROW, stencil
 from pace_optim.estimate.error_bars.assessment import Probes, make_probes
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty, uncertainty_of
 from pace_optim.motion.design.motion_check import MotionFinding, MotionLimits, check_command, check_simulated
 from pace_optim.motion.signals import Trajectory
+from pace_optim.problem.parameter_space import Colouring
 from pace_optim.problem.problem import Problem
 
 ProblemOf = Callable[[Sequence[Trajectory]], Problem]
@@ -60,15 +61,14 @@ def information_of(
         x: Where the parameters are expected to be, normalised (size,).
     """
     problem = problem_of(trajectories[:1])
-    colouring = colour(problem.space, problem.trees, problem.joint_names)
-    around = stencil(x, colouring, first=NARROW)
+    around = stencil(x, problem.colouring, first=NARROW)
     probes = make_probes(x, around, problem.trees, problem.joint_names)
     steps = around.steps.diagonal()
     at_once = max(1, _MEMORY // (len(probes.vectors) * trajectories[0].des_dof_pos.nbytes))
     result: list[Information] = []
     for start in range(0, len(trajectories), at_once):
         part = trajectories[start : start + at_once]
-        result += _simulated(problem_of(part), part, limits, probes, steps, colouring)
+        result += _simulated(problem_of(part), part, limits, probes, steps)
     return result
 
 
@@ -78,7 +78,6 @@ def _simulated(
     limits: MotionLimits,
     probes: Probes,
     steps: torch.Tensor,
-    colouring: Colouring,
 ) -> list[Information]:
     encoder, torque = _positions(problem, probes)
     bias = problem.space.to_physical(probes.vectors[0])[problem.space["encoder_bias"]].numpy()
@@ -88,8 +87,8 @@ def _simulated(
     for r, trajectory in enumerate(trajectories):
         position = encoder[0, :, r].numpy() + bias
         initial = probes.initial(encoder[:, :, r]).derivatives
-        derivatives = encoder[1 : 1 + len(colouring.colours), :, r] - encoder[0, :, r]
-        blocks = [_block(derivatives, initial, tree, steps, colouring) for tree in trees]
+        derivatives = encoder[1 : 1 + len(problem.colouring.colours), :, r] - encoder[0, :, r]
+        blocks = [_block(derivatives, initial, tree, steps, problem.colouring) for tree in trees]
         findings = [
             *check_command(trajectory, limits),
             *check_simulated(trajectory.time, position, torque[1:, r].numpy(), limits),
@@ -130,12 +129,10 @@ def _block(
         derivatives: Change of the positions by each colour's step, (colours, T, n) [rad].
         initial: Derivatives by the first positions, (sets, T, n).
         step: Signed step of every entry, (size,).
-        colouring: Which entries belong to which colour and joints.
     """
     size = len(step)
-    row_of = {entry: c for c, entries in enumerate(colouring.colours) for entry in entries}
     entries = [entry for entry in range(size) if set(tree) & set(colouring.joints[entry])]
-    columns = derivatives[[row_of[entry] for entry in entries]][..., tree].flatten(1) / step[entries, None]
+    columns = derivatives[[colouring.row_of[entry] for entry in entries]][..., tree].flatten(1) / step[entries, None]
     first = initial[..., tree].flatten(1)[: len(tree)]  # the i-th set moves this tree's i-th joint
     hessian, effect = columns @ columns.T, columns @ first.T
     at = np.ix_(entries, entries)
@@ -184,5 +181,4 @@ def expected_uncertainty(
         x: Where the parameters are expected to be, normalised (size,).
     """
     samples = int(problem.dataset.sampled.sum())
-    colouring = colour(problem.space, problem.trees, problem.joint_names)
-    return uncertainty_of(hessian, noise**2 * middle, samples, colouring, problem.space, x)
+    return uncertainty_of(hessian, noise**2 * middle, samples, problem.colouring, problem.space, x)

@@ -23,7 +23,7 @@ from pace_optim.diagnosis.selection.candidate_results import Round
 from pace_optim.diagnosis.selection.comparison import judge
 from pace_optim.diagnosis.verdict.verdict import confounded, ranking, verdict
 from pace_optim.joints.fits.block_errors import BlockErrors, block_errors, check_long_enough
-from pace_optim.joints.fits.labels import labels
+from pace_optim.joints.fits.model import labels
 from pace_optim.terminal.parallel import parallel_map
 
 STRIBECK, QUADRATIC, GAIN = (get_effect(n) for n in ("stribeck_friction", "quadratic_friction", "torque_gain"))

@@ -14,9 +14,10 @@ from problems import (
     record,
 )
 
-from pace_optim.estimate.derivatives import NARROW, Colouring, Jacobian, colour, stencil
+from pace_optim.estimate.derivatives import NARROW, Jacobian, stencil
 from pace_optim.estimate.levenberg_marquardt import LinearModel
 from pace_optim.problem.evaluator import Residuals
+from pace_optim.problem.parameter_space import Colouring
 
 ANYMAL_TRUTH = {"armature": 0.1, "viscous_friction": 4.5, "friction": 0.05, "encoder_bias": 0.05, "delay": 4.6}
 
@@ -40,7 +41,7 @@ def differentiate(problem, x, colouring):
 
 
 def coloured(problem):
-    return colour(problem.space, problem.trees, problem.joint_names)
+    return problem.colouring
 
 
 def uncoloured(problem):

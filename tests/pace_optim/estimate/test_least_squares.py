@@ -20,10 +20,10 @@ from problems import (
 from problems import normalised as normalised_truth
 from scipy.optimize import lsq_linear, minimize_scalar
 
-from pace_optim.estimate.derivatives import Colouring, colour
 from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, least_squares
 from pace_optim.estimate.levenberg_marquardt import bounded_step
 from pace_optim.problem.evaluator import Residuals
+from pace_optim.problem.parameter_space import Colouring
 from pace_optim.run.folder import RunFolder
 from pace_optim.run.history import History
 
@@ -31,7 +31,7 @@ from pace_optim.run.history import History
 def refine(problem, *starts, cfg=None, **options):
     starts = starts or (torch.zeros(problem.space.size, dtype=torch.float64),)
     evaluator = options.pop("evaluator", None) or problem.evaluator()
-    return least_squares(evaluator, colour(problem.space, problem.trees, problem.joint_names), starts, cfg, **options)
+    return least_squares(evaluator, starts, cfg, **options)
 
 
 # ---------------------------------------------------------------- recovery
@@ -83,10 +83,14 @@ def test_what_may_be_left_to_gain_grows_with_what_is_missing(times, part):
     assert LeastSquaresCfg().tolerance(1.0) == 1e-6  # the noise is unknown
 
 
+def dense(size):
+    return Colouring(colours=tuple((i,) for i in range(size)), joints=tuple((0,) for _ in range(size)))
+
+
 class Curved:
     """Residuals x - 0.3 and 1 + bend x²/2 in place of a simulation: what no x explains is large, and turns."""
 
-    looks_coarser = False
+    looks_coarser, colouring = False, dense(1)
 
     def __init__(self, bend):
         self.bend, self.space = bend, SimpleNamespace(to_physical=lambda x: x)
@@ -94,11 +98,11 @@ class Curved:
     def look_at_phases(self, physical, anew=False):
         return False
 
-    def look_around(self, x, where=None, own_step=False):
-        every = self.residuals(x, where)
+    def look_around(self, x, own_step=False):
+        every = self.residuals(x)
         return every.rows(0, 1), every
 
-    def residuals(self, physical, where=None):
+    def residuals(self, physical):
         x = physical[:, 0]
         error = torch.stack([x - 0.3, 1 + 0.5 * self.bend * x.square()], dim=1)[..., None, None]
         return Residuals(error=error, where=torch.ones(2, 1, dtype=torch.bool), step=torch.arange(2))
@@ -107,8 +111,7 @@ class Curved:
 @pytest.mark.parametrize(("bend", "start"), [(0.3, 0.25), (0.3, 0.2), (0.1, 0.25)])
 def test_no_descent_ends_on_derivatives_of_elsewhere(bend, start):
     """There the gradient of elsewhere is zero, not its own: it would end up to 3e-5 above the bottom."""
-    one = Colouring(colours=((0,),), joints=((0,),))
-    best = least_squares(Curved(bend), one, [torch.tensor([start], dtype=torch.float64)])[0]
+    best = least_squares(Curved(bend), [torch.tensor([start], dtype=torch.float64)])[0]
     bottom = minimize_scalar(lambda x: ((x - 0.3) ** 2 + (1 + 0.5 * bend * x**2) ** 2) / 2, tol=1e-12).fun
     assert best.stop_reason == "converged" and best.score < (1 + 1e-6) * bottom
 
@@ -143,7 +146,7 @@ def test_a_truth_beyond_a_bound_ends_at_the_bound_with_the_others_optimal(name, 
     assert float(scores.min()) > best.score
     inside = [i for i in others if abs(float(best.x[i])) < 0.999]
     best.gradient = None
-    _, gradient, _ = best.look(problem.evaluator(), colour(problem.space, problem.trees, problem.joint_names))
+    _, gradient, _ = best.look(problem.evaluator())
     assert float(gradient[inside].abs().max()) < 1e-2 * float(gradient[entry].abs())
     assert side * float(gradient[entry]) < 0  # downhill is outwards
 
@@ -212,8 +215,8 @@ class Fake:
 
     looks_coarser = False
 
-    def __init__(self, function):
-        self.function = function
+    def __init__(self, function, size):
+        self.function, self.colouring = function, dense(size)
         self.space = self
         self.batches = []
 
@@ -223,20 +226,15 @@ class Fake:
     def look_at_phases(self, physical, anew=False):
         return False
 
-    def look_around(self, x, where=None, own_step=False):
-        every = self.residuals(x, where)
+    def look_around(self, x, own_step=False):
+        every = self.residuals(x)
         return every.rows(0, 1), every
 
-    def residuals(self, x, where=None):
+    def residuals(self, x):
         self.batches.append(x)
-        assert where is None
         error = torch.stack([self.function(row) for row in x])[:, :, None, None]
         where = torch.ones(error.shape[1], 1, dtype=torch.bool)
         return Residuals(error=error, where=where, step=torch.arange(error.shape[1]))
-
-
-def dense(size):
-    return Colouring(colours=tuple((i,) for i in range(size)), joints=tuple((0,) for _ in range(size)))
 
 
 def test_trials_that_diverge_do_not_break_a_descent():
@@ -247,8 +245,8 @@ def test_trials_that_diverge_do_not_break_a_descent():
         bent = torch.stack([5 * (x[0] - target[0]), torch.tanh(4 * (x[1] - target[1]))])
         return far if x[1] < -0.6 else bent
 
-    fake = Fake(valley)
-    best = least_squares(fake, dense(2), [torch.tensor([-0.5, 0.4], dtype=torch.float64)])[0]
+    fake = Fake(valley, 2)
+    best = least_squares(fake, [torch.tensor([-0.5, 0.4], dtype=torch.float64)])[0]
     assert torch.stack([torch.isnan(valley(x)).any() for batch in fake.batches for x in batch]).any()
     assert torch.allclose(best.x, target, atol=1e-6) and best.score < 1e-12
 
@@ -258,7 +256,7 @@ def test_perturbed_vectors_that_diverge_do_not_break_a_descent():
         error = torch.stack([x[0] - 0.3, x[1] + 0.2])
         return torch.full_like(error, torch.nan) if x[0] > 0.5 and x[1] != 0.0 else error
 
-    best = least_squares(Fake(valley), dense(2), [torch.tensor([0.9, 0.0], dtype=torch.float64)])[0]
+    best = least_squares(Fake(valley, 2), [torch.tensor([0.9, 0.0], dtype=torch.float64)])[0]
     assert np.isfinite(best.score) and best.stop_reason
     assert bool(best.x.isfinite().all())
 
@@ -268,7 +266,7 @@ def test_a_start_that_diverges_is_given_up_and_the_others_go_on():
         return x - 0.1 if x[0] < 0.8 else torch.full_like(x, torch.nan)
 
     starts = [torch.full((2,), value, dtype=torch.float64) for value in (0.9, 0.0)]
-    best, worst = least_squares(Fake(valley), dense(2), starts)
+    best, worst = least_squares(Fake(valley, 2), starts)
     assert best.score < 1e-12 and worst.stop_reason == "diverged at its start"
 
 
@@ -287,7 +285,7 @@ def test_of_several_starts_the_hopeless_are_dropped_and_the_best_comes_first():
 
     cfg = LeastSquaresCfg(target_score=1e-20, score_tolerance=1e-12, creep_tolerance=0.0)
     starts = [torch.tensor([0.2], dtype=torch.float64), torch.tensor([-0.9], dtype=torch.float64)]
-    best, worst = least_squares(Fake(two_valleys), dense(1), starts, cfg)
+    best, worst = least_squares(Fake(two_valleys, 1), starts, cfg)
     assert float(best.x) == pytest.approx(0.5, abs=1e-6)
     assert worst.stop_reason == "another start is far better"
 
@@ -297,7 +295,7 @@ def test_a_start_that_comes_down_beside_a_better_one_is_dropped():
         return torch.cat([torch.sinh(x - 0.2), torch.ones_like(x)])
 
     starts = [torch.tensor([value], dtype=torch.float64) for value in (0.5, -0.7)]
-    best, second = least_squares(Fake(one_valley), dense(1), starts)
+    best, second = least_squares(Fake(one_valley, 1), starts)
     assert second.stop_reason == "another start is in the same valley"
     assert float(best.x) == pytest.approx(0.2, abs=1e-6)
 
@@ -341,7 +339,7 @@ class Rattling:
     A rotor's inertia, a delay that is nearly the same, and something else: one combination hardly moves anything.
     """
 
-    looks_coarser = False
+    looks_coarser, colouring = False, dense(3)
 
     def __init__(self, seed=0, rattle=RATTLE):
         generator = torch.Generator().manual_seed(seed)
@@ -357,11 +355,11 @@ class Rattling:
     def look_at_phases(self, physical, anew=False):
         return False
 
-    def look_around(self, x, where=None, own_step=False):
-        every = self.residuals(x, where)
+    def look_around(self, x, own_step=False):
+        every = self.residuals(x)
         return every.rows(0, 1), every
 
-    def residuals(self, x, where=None):
+    def residuals(self, x):
         self.rows += len(x)
         error = (x - TARGET) @ self.slope.T + self.noise + self.rattle * torch.sin(x @ self.wave.T + self.phase)
         where = torch.ones(SAMPLES, 1, dtype=torch.bool)
@@ -376,11 +374,11 @@ def rattling_start():
 def test_a_weak_combination_is_found_and_its_error_bars_are_those_without_the_rattle(seed):
     """Over narrow steps its derivative was the rattle's: it hardly moved, with error bars near zero."""
     rattling, calm = Rattling(seed), Rattling(seed, rattle=0.0)
-    best, right = (least_squares(each, dense(3), [rattling_start()])[0] for each in (rattling, calm))
+    best, right = (least_squares(each, [rattling_start()])[0] for each in (rattling, calm))
     bars = []
     for end, on in ((best, rattling), (right, calm)):
         end.gradient = None
-        hessian, *_ = end.look(on, dense(3))
+        hessian, *_ = end.look(on)
         bars.append((torch.linalg.inv(hessian) * end.score / SAMPLES).diagonal().sqrt())
     assert torch.allclose(bars[0], bars[1], rtol=0.25)
     assert ((best.x - TARGET).abs() < 3 * bars[0]).all()
@@ -393,20 +391,20 @@ class Misled(Rattling):
 
     looks_coarser = True
 
-    def look_around(self, x, where=None, own_step=False):
-        every = self.residuals(x, where)
+    def look_around(self, x, own_step=False):
+        every = self.residuals(x)
         wild = torch.randn(every.error.shape, generator=torch.Generator().manual_seed(self.rows))
         return every.rows(0, 1), every if own_step else dataclasses.replace(every, error=wild.double())
 
 
 def test_where_a_longer_step_leads_nowhere_the_fits_own_leads_on():
     """Hands of small links ended as converged with a fifth of their values wrong."""
-    best, right = (least_squares(each(), dense(3), [rattling_start()])[0] for each in (Misled, Rattling))
+    best, right = (least_squares(each(), [rattling_start()])[0] for each in (Misled, Rattling))
     assert best.own_step and not right.own_step and best.score < 1.05 * right.score
 
 
 def test_a_descent_that_was_interrupted_goes_on_as_if_it_had_not_been(tmp_path):
-    whole = least_squares(Rattling(), dense(3), [rattling_start()])[0]
+    whole = least_squares(Rattling(), [rattling_start()])[0]
     for stop in range(1, whole.iteration):
 
         def interrupt(descents, stop=stop):
@@ -415,8 +413,8 @@ def test_a_descent_that_was_interrupted_goes_on_as_if_it_had_not_been(tmp_path):
 
         descents = [Descent(x=rattling_start())]
         with pytest.raises(KeyboardInterrupt):
-            least_squares(Rattling(), dense(3), descents, on_iteration=interrupt)
+            least_squares(Rattling(), descents, on_iteration=interrupt)
         folder = RunFolder(tmp_path)
         folder.write_checkpoint(None, torch.zeros(0, dtype=torch.float64), descents, [], 0, 0, History())
-        on = least_squares(Rattling(), dense(3), Descent.restore(folder.read_checkpoint()))[0]
+        on = least_squares(Rattling(), Descent.restore(folder.read_checkpoint()))[0]
         assert torch.equal(on.x, whole.x) and on.scores == whole.scores and on.iteration == whole.iteration

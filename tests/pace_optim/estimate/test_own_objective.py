@@ -6,7 +6,6 @@ import os
 import subprocess
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,12 +18,10 @@ from pace_envs.contact_sensor import ContactSensorCfg
 from pace_optim import CMAESOptimizer
 from pace_optim.estimate.cmaes_optimizer import CMAESOptimizerCfg
 from pace_optim.estimate.convergence import EarlyStopping, Plateau, ScoreGradient, SearchState, stop_rule
-from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.least_squares import LeastSquaresCfg, least_squares
-from pace_optim.estimate.own_objective import Objective, optimizer_class
+from pace_optim.estimate.own_objective import Objective, objective_error_bars, optimizer_class
 from pace_optim.identification.fit import fit, resume
-from pace_optim.identification.own_objective import error_bars
 from pace_optim.recording import load_recording, save_recording
 from pace_optim.run.settings import FitSettings
 from pace_optim.terminal.progress import ProgressLine
@@ -111,11 +108,10 @@ def test_scores_of_a_wrong_shape_are_refused(recording):
 
 def test_error_bars_of_squared_positions_are_those_of_least_squares():
     problem = make_problem(record(chirp(2.0), noise=1e-4))
-    evaluator, colouring = problem.training_evaluator(), colour(problem.space, problem.trees, problem.joint_names)
-    x = least_squares(evaluator, colouring, [problem.space.start], LeastSquaresCfg())[0].x
-    expected = assess(problem, problem.evaluator(), colouring, x).uncertainty
-    run = SimpleNamespace(problem=problem, evaluator=evaluator, colouring=colouring)
-    found, score = error_bars(run, Objective(Plain, problem), x)
+    evaluator = problem.training_evaluator()
+    x = least_squares(evaluator, [problem.space.start], LeastSquaresCfg())[0].x
+    expected = assess(problem, problem.evaluator(), x).uncertainty
+    found, score = objective_error_bars(Objective(Plain, problem), evaluator, x)
     assert score == pytest.approx(float(evaluator.residuals(problem.space.to_physical(x[None])).score), rel=1e-9)
     ratio = found.std / expected.std
     assert ratio.min() > 0.5 and ratio.max() < 2.0

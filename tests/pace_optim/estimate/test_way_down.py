@@ -1,11 +1,10 @@
-"""The way down: on pieces, elsewhere where these end above the noise, on the whole; and resumed."""
+"""The way down: on pieces, by a search where these end above the noise, on the whole; and resumed."""
 
 import pytest
 import torch
 from problems import TRUTH, chirp, env_cfg, make_problem, normalised, record, replayed
 
 from pace_envs import set_physics_dt
-from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, checkpoint_of, least_squares
 from pace_optim.estimate.way_down import PIECES, WHOLE, WayDown, WayDownCfg
@@ -14,11 +13,6 @@ from pace_optim.estimate.way_down import PIECES, WHOLE, WayDown, WayDownCfg
 @pytest.fixture(scope="module")
 def problem():
     return make_problem()
-
-
-@pytest.fixture
-def colouring(problem):
-    return colour(problem.space, problem.trees, problem.joint_names)
 
 
 def centre(problem):
@@ -34,57 +28,59 @@ def test_pieces_are_a_share_of_the_windows_of_each_recording():
     assert all(bool(each) for each in pieces.train.any(dim=0))
 
 
-def way(problem, colouring, **options):
-    pieces = problem.on_pieces(0.25).training_evaluator()
-    return WayDown(problem.training_evaluator(), colouring, **{"pieces": pieces, **options})
+def way(problem, noise_score=0.0, on_pieces=None, **options):
+    cfg = WayDownCfg(share=0.25, **({} if on_pieces is None else {"on_pieces": on_pieces}))
+    result = WayDown(problem, cfg=cfg, **options)
+    result.noise_score = noise_score
+    return result
 
 
-def test_it_ends_at_the_truth_with_fewer_steps_than_least_squares_alone(problem, colouring):
-    plain, staged = problem.training_evaluator(), way(problem, colouring)
-    least_squares(plain, colouring, [centre(problem)])
+def test_it_ends_at_the_truth_with_fewer_steps_than_least_squares_alone(problem):
+    plain, staged = problem.training_evaluator(), way(problem)
+    least_squares(plain, [centre(problem)])
     best = staged.run([centre(problem)])
     assert best.score < 1e-14 and best.stage == WHOLE
     torch.testing.assert_close(best.x, normalised(problem), atol=1e-4, rtol=0)
     assert staged.evaluator.simulated_steps < plain.simulated_steps
 
 
-def test_a_start_that_is_better_than_its_end_on_pieces_is_kept(problem, colouring):
-    staged = way(problem, colouring)
+def test_a_start_that_is_better_than_its_end_on_pieces_is_kept(problem):
+    staged = way(problem)
     astray = torch.full_like(centre(problem), 0.9)
     staged.descents = [Descent(x=astray, stage=PIECES, stop_reason="converged", scores=[1.0])]
     best = staged.run([normalised(problem)])
     assert torch.equal(best.x, normalised(problem)) and best.score < 1e-14
 
 
-def test_derivatives_of_a_longer_step_lead_to_the_end_of_the_finer_one(problem, colouring):
+def test_derivatives_of_a_longer_step_lead_to_the_end_of_the_finer_one(problem):
     cfg = env_cfg()
     set_physics_dt(cfg, cfg.sim.dt / 4)
     fine = make_problem(record(cfg=cfg)).with_physics_dt(cfg.sim.dt)
     nearby, plain = fine.training_evaluator(), fine.evaluator()
-    best, expected = (least_squares(each, colouring, [centre(problem)])[0] for each in (nearby, plain))
+    best, expected = (least_squares(each, [centre(problem)])[0] for each in (nearby, plain))
     assert best.score < 1e-14 and expected.score < 1e-14
     torch.testing.assert_close(best.x, expected.x, atol=1e-4, rtol=0)
     at_the_finer_step = sum(rollout.simulated_steps for rollout in nearby._rollouts.values())
     assert at_the_finer_step < 0.65 * plain.simulated_steps
 
 
-def test_the_derivatives_of_the_error_bars_lead_from_beside_the_minimum_into_it(colouring):
+def test_the_derivatives_of_the_error_bars_lead_from_beside_the_minimum_into_it():
     """A descent by derivatives of a longer step stops beside it."""
     cfg = env_cfg()
     set_physics_dt(cfg, cfg.sim.dt / 4)
     fine = make_problem(record(cfg=cfg)).with_physics_dt(cfg.sim.dt)
     nearby = fine.training_evaluator()
-    beside = least_squares(nearby, colouring, [centre(fine)], LeastSquaresCfg(max_iteration=2))[0]
-    known = assess(fine, fine.evaluator(), colouring, beside.x, beside, nearby)
+    beside = least_squares(nearby, [centre(fine)], LeastSquaresCfg(max_iteration=2))[0]
+    known = assess(fine, fine.evaluator(), beside.x, beside, nearby)
     assert beside.score > 1e-8 and float(known.jacobian.residuals.score[0]) < 1e-6 * beside.score
     torch.testing.assert_close(known.x, normalised(fine), atol=1e-3, rtol=0)
 
 
 @pytest.mark.parametrize("noise", [0.0, 1.0])
-def test_it_is_searched_only_where_the_pieces_end_above_the_noise(problem, colouring, noise):
+def test_it_is_searched_only_where_the_pieces_end_above_the_noise(problem, noise):
     """A descent that stops at once stands for one that ends in a wrong valley."""
     stuck = LeastSquaresCfg(max_iteration=1)
-    staged = way(problem, colouring, noise_score=noise, cfg=WayDownCfg(on_pieces=stuck))
+    staged = way(problem, noise_score=noise, on_pieces=stuck)
     budgets = []
 
     def search(budget, around):
@@ -98,9 +94,9 @@ def test_it_is_searched_only_where_the_pieces_end_above_the_noise(problem, colou
 
 
 @pytest.mark.parametrize("missing", [0.0, 1.0])
-def test_it_is_not_searched_where_missing_physics_leaves_as_much(problem, colouring, missing):
+def test_it_is_not_searched_where_missing_physics_leaves_as_much(problem, missing):
     stuck = LeastSquaresCfg(max_iteration=1)
-    staged = way(problem, colouring, noise_score=1e-12, cfg=WayDownCfg(on_pieces=stuck))
+    staged = way(problem, noise_score=1e-12, on_pieces=stuck)
     staged.missing_score = missing
     searched = []
     staged.run([torch.full_like(centre(problem), 0.9)], lambda *_: searched.append(0) or [])
@@ -113,13 +109,13 @@ def test_an_iteration_must_gain_more_where_the_score_is_far_above_the_noise():
     assert LeastSquaresCfg(noise_score=1e-8).enough(1e-6) == 2e-3
 
 
-def test_a_way_that_is_resumed_is_the_one_that_was_interrupted(problem, colouring):
+def test_a_way_that_is_resumed_is_the_one_that_was_interrupted(problem):
     seen = []
-    staged = way(problem, colouring, on_iteration=lambda _: seen.append(checkpoint_of(staged.descents)))
+    staged = way(problem, on_iteration=lambda _: seen.append(checkpoint_of(staged.descents)))
     whole = staged.run([centre(problem)])
     assert {d.stage for d in staged.descents} == {PIECES, WHOLE}
     for kept in seen:
-        again = way(problem, colouring)
+        again = way(problem)
         again.descents = Descent.restore(kept)
         end = again.run([centre(problem)])
         assert torch.equal(end.x, whole.x) and end.scores == whole.scores

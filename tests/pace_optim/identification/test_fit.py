@@ -331,7 +331,7 @@ def test_interrupted_before_anything_is_known_still_ends_cleanly(recordings, tmp
     def at_once(*args, **kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(WayDown, "run", at_once)
+    monkeypatch.setattr(WayDown, "begin", at_once)
     result, folder = run(tmp_path, recordings["clean"])
     assert result.stop_reasons == ["interrupted"] and (folder / "result.json").is_file()
 
@@ -459,5 +459,5 @@ def test_derivatives_are_taken_at_the_longest_step_that_the_drives_allow(tmp_pat
     run = Optimization(
         settings, load_for_fit(settings, load_env_cfg(settings.task)), RunFolder(tmp_path), ProgressLine()
     )
-    fine, coarse = (evaluator._make_env(1).cfg.sim.dt for evaluator in (run.evaluator, run.evaluator._nearby))
+    fine, coarse = (evaluator._make_env(1).cfg.sim.dt for evaluator in (run.way.evaluator, run.way.evaluator._nearby))
     assert fine < coarse == 0.0025

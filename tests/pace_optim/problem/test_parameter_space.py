@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from problems import TRUTH, chirp, env_cfg, make_problem, range_error, record
 
 from pace_envs.tasks.pace import Parameter, base_parameters
-from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.least_squares import least_squares
 from pace_optim.problem.parameter_space import ParameterSpace
 
@@ -163,7 +162,7 @@ def test_one_declaration_adds_a_parameter_that_a_fit_recovers():
     unlike = make_problem(record(fast, truth, cfg=cfg), cfg=env_cfg(extra_parameters=(other,)))
     wrong = unlike.evaluator().residuals(unlike.space.from_dict({**truth, "saturation_effort": 60.0})[None])
     assert float(wrong.score) > 1e-8  # it reaches the simulation
-    best = least_squares(evaluator, colour(problem.space, problem.trees, problem.joint_names), [start])[0]
+    best = least_squares(evaluator, [start])[0]
     assert best.score < 1e-9 * float(before)
     assert range_error(problem, best.x, truth) < 1e-3
     assert float(problem.space.to_physical(best.x)[-1]) == pytest.approx(50.0, rel=1e-3)

@@ -10,7 +10,7 @@ from walking import DT, crawler, walking_problem, write_log
 
 from pace_envs import ManagerBasedRLEnv, load_env_cfg
 from pace_envs.compiler import host
-from pace_optim.estimate.derivatives import colour, stencil
+from pace_optim.estimate.derivatives import stencil
 from pace_optim.estimate.error_bars.assessment import _LATE, _late_forces
 from pace_optim.problem.free_phases import FreePhases, encoder_noise
 from pace_optim.problem.moving_base import base_path, imu_pose, joints_of_feet, on_moving_base
@@ -36,7 +36,7 @@ def at_once(monkeypatch):
 def steps_of(problem, x):
     """Where one Gauss-Newton step from x leads, physical (size,)."""
     evaluator, space = problem.training_evaluator(), problem.space
-    around = stencil(x, colour(space, problem.trees, problem.joint_names), first=3e-3)
+    around = stencil(x, problem.colouring, first=3e-3)
     residuals = evaluator.residuals(space.to_physical(torch.cat([x[None], around.vectors])))
     hessian, gradient = around.jacobian(residuals).normal_equations()
     scale = hessian.diagonal().clamp(min=1e-30).sqrt()
@@ -56,7 +56,7 @@ def test_swinging_legs_have_the_truth_at_the_bottom_of_their_error(walk):
     assert float((found - truth)[problem.space["delay"]].abs().max()) * DT < 1e-3
     # error bars know of forces that act later than the rows say: d - kp τ, a - (kd + d) τ, delay + τ
     space, x = problem.space, problem.space.to_normalised(truth)
-    late = torch.as_tensor(_late_forces(jacobian, problem.training_evaluator(), space, x))
+    late = torch.as_tensor(_late_forces(jacobian, problem.training_evaluator(), x))
     hessian = jacobian.normal_equations()[0] * residuals.where.sum()
     move = torch.linalg.pinv(hessian, rtol=1e-13, hermitian=True) @ late * space.slope(x)
     assert move[space["viscous_friction"]] == pytest.approx(-40 * _LATE, rel=0.02)

@@ -10,11 +10,11 @@ from problems import CALM, DT, chirp, env_cfg, make_problem, physical, replayed
 from pace_actuators.effects import get_effect
 from pace_envs import set_physics_dt
 from pace_envs.compiler import host_kernels
+from pace_optim.estimate.error_bars.physics_step import step_error
 from pace_optim.joints.fits.base_fit import joint_vectors
 from pace_optim.joints.fits.model import JointModel
 from pace_optim.joints.fits.side_by_side import SideBySide, Slot
 from pace_optim.joints.simulation import reference_path, twin_problem
-from pace_optim.problem.step_error import step_error
 from pace_optim.recording.windows import Windows
 
 DURATION = 6.5

@@ -9,8 +9,7 @@ from pace_envs import load_env_cfg
 from pace_envs.tasks.pace.parameters import effect_parameters
 from pace_optim.diagnosis.search.one_round import beyond_bounds, with_likes
 from pace_optim.joints.fits.fitted import Fitted
-from pace_optim.joints.fits.labels import labels
-from pace_optim.joints.fits.model import JointModel
+from pace_optim.joints.fits.model import JointModel, labels
 
 OFFSET, PAYLOAD, GAIN = (get_effect(name) for name in ("torque_offset", "payload", "torque_gain"))
 ALL = [get_effect(name) for name in available_effects()]

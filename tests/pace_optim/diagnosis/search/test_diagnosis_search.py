@@ -19,8 +19,7 @@ from pace_optim.diagnosis.search.state import Branch
 from pace_optim.diagnosis.selection.candidate_results import Round
 from pace_optim.diagnosis.selection.choice import choose
 from pace_optim.joints.fits.fitted import Fitted
-from pace_optim.joints.fits.labels import labels
-from pace_optim.joints.fits.model import BASE, JointModel
+from pace_optim.joints.fits.model import BASE, JointModel, labels
 from pace_optim.motion.design import telling_apart
 from pace_optim.motion.design.telling_apart import MenuCfg, Rivals, distances, menu, next_experiments
 

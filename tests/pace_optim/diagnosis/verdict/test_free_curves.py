@@ -25,8 +25,7 @@ from pace_optim.joints.fits.base_fit import fit_base
 from pace_optim.joints.fits.block_errors import BlockErrors
 from pace_optim.joints.fits.fits import Fits
 from pace_optim.joints.fits.fitted import Fitted
-from pace_optim.joints.fits.labels import labels
-from pace_optim.joints.fits.model import BASE, JointModel
+from pace_optim.joints.fits.model import BASE, JointModel, labels
 from pace_optim.report import write_report
 from pace_optim.run.result import FitResult
 

@@ -25,8 +25,7 @@ from pace_optim.diagnosis.verdict.names import Hint, Names, beside_curves, earne
 from pace_optim.diagnosis.verdict.sizes import error_bars_from_none
 from pace_optim.diagnosis.verdict.verdict import part_explained, verdict
 from pace_optim.joints.fits.fitted import Fitted
-from pace_optim.joints.fits.labels import labels
-from pace_optim.joints.fits.model import BASE, JointModel
+from pace_optim.joints.fits.model import BASE, JointModel, labels
 from pace_optim.recording import Load
 from pace_optim.report import write_report
 from pace_optim.run.result import FitResult

@@ -9,7 +9,6 @@ from problems import chirp, env_cfg, make_problem, record
 
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.tasks.pace import Parameter
-from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars import consistency
 from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.error_bars.consistency import check_consistency
@@ -25,7 +24,7 @@ def checked(recordings):
     problem = make_problem(recordings)
     start = torch.zeros(problem.space.size, dtype=torch.float64)
     evaluator = problem.training_evaluator()
-    best = least_squares(evaluator, colour(problem.space, problem.trees, problem.joint_names), [start])[0]
+    best = least_squares(evaluator, [start])[0]
     return check_consistency(problem, best.x, best.score)
 
 
@@ -103,10 +102,10 @@ def test_recordings_are_fitted_alone_from_the_derivatives_that_are_known(recordi
     """The same is said of each, for fewer simulations."""
     wrong = dataclasses.replace(recordings[2], drive=Drive(stiffness=np.array([120.0]), damping=np.array([3.6])))
     problem = make_problem([*recordings[:2], wrong])
-    evaluator, colouring = problem.training_evaluator(), colour(problem.space, problem.trees, problem.joint_names)
+    evaluator = problem.training_evaluator()
     start = torch.zeros(problem.space.size, dtype=torch.float64)
-    best = least_squares(evaluator, colouring, [start])[0]
-    there = assess(problem, evaluator, colouring, best.x).jacobian
+    best = least_squares(evaluator, [start])[0]
+    there = assess(problem, evaluator, best.x).jacobian
     anew, known = (check_consistency(problem, best.x, best.score, there=given) for given in (None, there))
     assert known.simulated_steps < anew.simulated_steps
     assert [text[:60] for text in known.sentences] == [text[:60] for text in anew.sentences]

@@ -20,7 +20,6 @@ from problems import (
 )
 from scipy.optimize import brentq
 
-from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty
 from pace_optim.estimate.error_bars.warnings import critical_delay, fit_warnings, in_words
@@ -166,8 +165,8 @@ def test_commands_count_as_logged_too_rarely_where_a_delay_of_none_is_too_late(o
 def test_a_fit_whose_truth_is_beyond_a_bound_is_told():
     problem = make_problem(record(truth={**TRUTH, "friction": 0.0}, noise=1e-4))
     x = normalised(problem, {**TRUTH, "friction": 0.0})
-    evaluator, colouring = problem.evaluator(), colour(problem.space, problem.trees, problem.joint_names)
-    uncertainty = assess(problem, evaluator, colouring, x).uncertainty
+    evaluator = problem.evaluator()
+    uncertainty = assess(problem, evaluator, x).uncertainty
     told = fit_warnings(problem, problem.space.to_physical(x), uncertainty, FINE)
     assert len(told) == 1 and told[0].startswith("At a bound: friction (lower, 0 N m) of servo.")
 

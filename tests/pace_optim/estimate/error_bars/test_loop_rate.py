@@ -8,7 +8,6 @@ import torch
 from problems import BENCH, CALM, chirp, env_cfg, make_problem, record, replayed
 
 from pace_envs.task_source import EnvironmentRecord
-from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.error_bars.loop_rate import LoopRates, _against, _lagrange, loop_rates
 from pace_optim.estimate.least_squares import LeastSquaresCfg, least_squares
@@ -34,10 +33,10 @@ def recorded_at(period, duration=1.0, noise=1e-4):
 
 def fitted(problem):
     """Where a fit from the truth ends, and what is known there."""
-    colouring, evaluator = colour(problem.space, problem.trees, problem.joint_names), problem.training_evaluator()
+    evaluator = problem.training_evaluator()
     start = problem.space.to_normalised(problem.space.from_dict(CALM))
-    best = least_squares(evaluator, colouring, [start], LeastSquaresCfg(max_iteration=8))[0]
-    return best.x, assess(problem, evaluator, colouring, best.x)
+    best = least_squares(evaluator, [start], LeastSquaresCfg(max_iteration=8))[0]
+    return best.x, assess(problem, evaluator, best.x)
 
 
 def test_a_recording_of_a_simulation_with_the_assumed_rate_and_this_very_step_says_nothing_of_others():
@@ -48,7 +47,7 @@ def test_a_recording_of_a_simulation_with_the_assumed_rate_and_this_very_step_sa
 
 def test_a_rate_that_fits_best_is_compared_with_the_others_too():
     """Its values depend on it all the same. Where the fit's own step was the best, none was compared."""
-    problem = recorded_at(0.0005).with_drive_dt(0.0005)
+    problem = recorded_at(0.0005).with_loop(0.0005)
     problem = dataclasses.replace(problem, assumed_loop=problem.loop_dt)
     x, known = fitted(problem)
     rates = loop_rates(problem, x, known.jacobian, ~np.isnan(known.uncertainty.std))
@@ -102,10 +101,10 @@ def test_only_drive_dt_states_a_rate():
     assert not problem.assumes_loop_rate  # a configuration says how its drives run
     of_file = dataclasses.replace(problem, assumed_loop=problem.loop_dt)
     assert of_file.assumes_loop_rate
-    stated = of_file.with_drive_dt(0.001)
-    assert not stated.assumes_loop_rate and stated.loop_dt == 0.001 and stated.physics_dt == 0.0005
-    continuous = of_file.with_drive_dt(0.0)
-    assert not continuous.assumes_loop_rate and continuous.physics_dt == of_file.physics_dt
+    faster = of_file.with_loop(0.001)
+    assert faster.loop_dt == 0.001 and faster.physics_dt == 0.0005
+    continuous = of_file.with_loop(0.0)
+    assert continuous.physics_dt == of_file.physics_dt
     assert all(drive.implicit for drive in continuous.plain_cfg.scene.robot.actuators.values())
 
 

@@ -9,9 +9,8 @@ from problems import BENCH, CALM, chirp, env_cfg, make_problem, replayed
 from pace_envs import set_physics_dt
 from pace_envs.task_source import EnvironmentRecord
 from pace_optim import fit
-from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.assessment import assess
-from pace_optim.estimate.error_bars.undetermined import change_without_step, step_share
+from pace_optim.estimate.error_bars.physics_step import change_without_step, step_share
 from pace_optim.estimate.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.identification.conclude import conclude
 from pace_optim.identification.optimization import Optimization
@@ -58,11 +57,11 @@ def test_a_recording_that_the_step_itself_made_has_no_share():
 def end_of(recorded, duration=2.0):
     """A fit at 2.5 ms to a recording of the bench: its problem, error, vector and what is known there."""
     problem = make_problem(replayed(chirp(duration), CALM, recorded, noise=1e-4))
-    colouring, evaluator = colour(problem.space, problem.trees, problem.joint_names), problem.training_evaluator()
+    evaluator = problem.training_evaluator()
     truth = problem.space.from_dict(CALM)
     start = problem.space.to_normalised(truth)
-    best = least_squares(evaluator, colouring, [start], LeastSquaresCfg(max_iteration=8))[0]
-    known = assess(problem, evaluator, colouring, best.x)
+    best = least_squares(evaluator, [start], LeastSquaresCfg(max_iteration=8))[0]
+    known = assess(problem, evaluator, best.x)
     return problem, (problem.space.to_physical(best.x) - truth).numpy(), best.x, known
 
 

@@ -7,7 +7,6 @@ from linear_problems import linear
 from problems import TRUTH, chirp, env_cfg, make_problem, normalised, physical, record
 
 from pace_envs.tasks.pace import Parameter
-from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty, autocovariance, estimate_uncertainty
 from pace_optim.estimate.error_bars.undetermined import _wide
@@ -243,7 +242,7 @@ def test_everything_at_its_bound_is_survived():
 
 
 def assessed(problem, x):
-    return assess(problem, problem.evaluator(), colour(problem.space, problem.trees, problem.joint_names), x)
+    return assess(problem, problem.evaluator(), x)
 
 
 def test_a_drive_that_is_off_hides_the_delay():
@@ -283,9 +282,8 @@ def test_the_truth_is_inside_the_95_percent_interval_in_90_to_99_percent_of_case
         noisy = clean.dof_pos + noise * rng.standard_normal(clean.dof_pos.shape)
         problem = make_problem([type(clean)(**{**vars(clean), "dof_pos": noisy})])
         evaluator = problem.evaluator()
-        colouring = colour(problem.space, problem.trees, problem.joint_names)
-        best = least_squares(evaluator, colouring, [normalised(problem)])[0]
-        uncertainty = assess(problem, evaluator, colouring, best.x).uncertainty
+        best = least_squares(evaluator, [normalised(problem)])[0]
+        uncertainty = assess(problem, evaluator, best.x).uncertainty
         error = (problem.space.to_physical(best.x) - physical(problem, TRUTH)).numpy()
         inside += (np.abs(error) < 1.96 * uncertainty.std).tolist()
     assert 0.90 <= np.mean(inside) <= 0.99

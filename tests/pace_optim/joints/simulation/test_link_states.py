@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pace_envs.link_inertia import FIELDS, fields_of, pseudo_inertia_of
-from pace_optim.joints.simulation.link_states import LinkStates
+from pace_optim.joints.simulation.joint_load import LinkStates
 
 ARM = """
 <mujoco><option gravity="1 -2 -9"/><worldbody><body pos="0 0 1"><joint name="a" axis="0 1 0"/>

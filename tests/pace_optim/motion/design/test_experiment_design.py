@@ -11,7 +11,6 @@ from pace_envs import load_env_cfg
 from pace_envs.tasks.pace import ExcitationCfg
 from pace_optim.data_collection import CollectionCfg, collect
 from pace_optim.data_collection.design import expected_parameters
-from pace_optim.estimate.derivatives import colour
 from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.least_squares import least_squares
 from pace_optim.motion.design import DesignCfg, optimize_motion
@@ -69,9 +68,9 @@ def design(cfg=None, limits=LIMITS, *, settings=SMALL, excitation="chirp", durat
 
 def fitted(recording, start=None):
     problem = make_problem(recording)
-    evaluator, colouring = problem.evaluator(), colour(problem.space, problem.trees, problem.joint_names)
-    x = least_squares(evaluator, colouring, [normalised(problem, NEAR) if start is None else start])[0].x
-    uncertainty = assess(problem, evaluator, colouring, x).uncertainty
+    evaluator = problem.evaluator()
+    x = least_squares(evaluator, [normalised(problem, NEAR) if start is None else start])[0].x
+    uncertainty = assess(problem, evaluator, x).uncertainty
     width = (problem.space.upper - problem.space.lower).numpy()
     return problem.space.to_physical(x).numpy(), uncertainty, width
 
