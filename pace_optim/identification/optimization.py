@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -13,11 +13,12 @@ from pace_actuators.effects import effect_cfgs
 from pace_actuators.joint_units import units_for
 from pace_optim.estimate.cmaes_optimizer import CMAESOptimizer
 from pace_optim.estimate.comb_scan import scanned
+from pace_optim.estimate.derivatives import Jacobian
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
 from pace_optim.estimate.error_bars.loop_rate import UNEXPLAINED
 from pace_optim.estimate.error_bars.uncertainty import torque_noise
 from pace_optim.estimate.error_bars.undetermined import at_prior
-from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg
+from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, by_chords
 from pace_optim.estimate.search import agree_to_stop, search
 from pace_optim.estimate.way_down import PIECES, WHOLE, WayDown
 from pace_optim.identification.balanced_start import balanced_start
@@ -31,6 +32,7 @@ from pace_optim.run.tensorboard_log import TensorBoardLog
 from pace_optim.terminal.processes import Processes
 from pace_optim.terminal.progress import ProgressLine
 
+_T = TypeVar("_T")
 NEAR = LeastSquaresCfg(score_tolerance=0.02)
 """For a vector that is known to be near the best."""
 INTERRUPTED = "interrupted"
@@ -227,15 +229,19 @@ class Optimization:
         return dict(zip(self.problem.joint_names, values, strict=False))
 
     def _look(self, evaluator: Evaluator, x: torch.Tensor) -> Residuals:
-        """Residuals of normalised vectors (m, size) between descents.
+        """Residuals of normalised vectors (m, size) between descents."""
+        return self._looked(evaluator, lambda: evaluator.residuals(evaluator.space.to_physical(x)))
+
+    def _looked(self, evaluator: Evaluator, look: Callable[[], _T]) -> _T:
+        """What is simulated between descents.
 
         A run that is resumed looks again; the steps of looks before the interruption were counted before.
         """
         before, self._looks = evaluator.simulated_steps, self._looks + 1
-        residuals = evaluator.residuals(evaluator.space.to_physical(x))
+        result = look()
         if self._looks <= self._looks_before:
             self._steps_before -= evaluator.simulated_steps - before
-        return residuals
+        return result
 
     def _with_structure(self, best: Descent) -> Descent:
         """Take the way with another structure of effects, begun at their probes, if it leads further on pieces.
@@ -287,20 +293,45 @@ class Optimization:
         problem, noise = self.problem, noise_score(self.problem)
         if not problem.assumes_loop_rate:
             return best
-        found, least = None, best
+        found, least, there = None, best, None
         for period in _LOOPS if problem.delay_mode == "command" else _LOOPS[:1]:
             if period == problem.loop_dt or least.score <= _IN_DOUBT**2 * noise:
                 continue
             rate = f"at {1e-3 / period:g} kHz" if period else "continuously"
             self.progress.say(f"error above the noise: fitting drive loops that run {rate}, as none is stated")
             other = self._way(problem.with_loop(period), f"loop of {period:g} s")
-            end = other.begin([least.x])
+            there = there or self._derivatives(best)
+            start = self._by_known_derivatives(other, best, there)
+            if start is None:
+                continue
+            end = other.begin([start])
             if end.score < least.score:
                 found, least = other, end
         if found is None or best.score - least.score <= UNEXPLAINED * (least.score - noise):
             return best
         self._search_on(found)
         return least
+
+    def _derivatives(self, best: Descent) -> Jacobian:
+        """Residuals and derivatives on pieces at the best end there."""
+        again = replace(best, gradient=None, jacobian=None, scores=list(best.scores))
+        jacobian = self._looked(self.way.pieces, lambda: again.look(self.way.pieces)[2])
+        if jacobian is None:
+            raise ValueError("A descent whose gradient is not known looks around.")
+        return jacobian
+
+    def _by_known_derivatives(self, other: WayDown, best: Descent, there: Jacobian) -> torch.Tensor | None:
+        """Where steps by the derivatives of the best end on pieces lead on another way; ``None`` if to no lower end."""
+        pieces = other.pieces
+        pieces.phases = self.way.pieces.phases
+        begin = self._look(pieces, best.x[None])
+        if not bool(begin.score.isfinite()):
+            return None
+        x, near, is_end = self._looked(
+            pieces,
+            lambda: by_chords(pieces, best.x, replace(there, residuals=begin), other.cfg.on_pieces.score_tolerance),
+        )
+        return None if is_end and float(near.residuals.score[0]) >= best.score else x
 
     def with_loop(self, period: float, x: torch.Tensor) -> Outcome:
         """Go on with loops of another period [s], near where a fit of pieces with it ends, normalised (size,)."""

@@ -149,6 +149,13 @@ def _pull(env: ManagerBasedRLEnv, recording: Recording) -> np.ndarray:
     return np.where(dt > 0, kd * dt + 0.5 * kp * dt**2, 0.0)
 
 
+def loop_gains(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> tuple[np.ndarray, np.ndarray]:
+    """Stiffness [N m/rad] and damping [N m s/rad] of each joint's loop, means of the recordings', (n,) each."""
+    kp = [_stated(each.drive.stiffness, of_joints(env, "stiffness")) for each in recordings]
+    kd = [_stated(each.drive.damping, of_joints(env, "damping")) for each in recordings]
+    return np.mean(kp, axis=0), np.mean(kd, axis=0)
+
+
 def _stated(own: np.ndarray | None, configured: np.ndarray) -> np.ndarray:
     return configured if own is None else np.broadcast_to(np.asarray(own, dtype=float), configured.shape)
 

@@ -19,6 +19,8 @@ from pace_optim.estimate.derivatives import Jacobian
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
 from pace_optim.estimate.error_bars.uncertainty import SURE, autocovariance, filtered
 from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, by_chords, least_squares
+from pace_optim.problem.drive_steps import loop_gains
+from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.free_phases import FreePhases
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
@@ -155,9 +157,10 @@ def loop_rates(
 ) -> LoopRates | None:
     """Compare the rates that the loops may have, at a fit with one of them.
 
-    All are simulated with one physics step and fitted again, each from the end of the one nearest to it, by the fit's
-    derivatives as long as they serve. Residuals and values between the shortest simulated periods follow by the
-    polynomial through these. With r the residuals of a candidate and d = r - r' their difference to the best one's,
+    All are simulated with one physics step and fitted again, by the fit's derivatives as long as they serve. Each begins
+    at the end of the one nearest to it, or where a later loop moves that, whichever is better. Residuals and values
+    between the shortest simulated periods follow by the polynomial through these. With r the residuals of a candidate
+    and d = r - r' their difference to the best one's,
 
         χ² = (r·r - r'·r') d·d / (dᵀ Σ d)
 
@@ -185,9 +188,9 @@ def loop_rates(
     finest = min(_FINEST, control / 2)
     ends: dict[float, _Refit] = {}
     for period in sorted(periods, key=lambda each: abs(each - fitted)):
-        nearest = min(ends, key=lambda other: abs(other - period), default=None)
-        begin = x if nearest is None else ends[nearest].x
-        end = _refitted(problem.with_loop(period, finest), problem, begin, there, phases)
+        nearest = min(ends, key=lambda other: abs(other - period), default=fitted)
+        begin = ends[nearest].x if ends else x
+        end = _refitted(problem.with_loop(period, finest), problem, begin, period - nearest, there, phases)
         if end is not None:
             ends[period] = end
         elif period == fitted:
@@ -231,18 +234,40 @@ class _Refit:
     """On the training samples, (K, R, n) [rad]."""
 
 
-def _refitted(
-    other: Problem, problem: Problem, x: torch.Tensor, there: Jacobian, phases: FreePhases | None
-) -> _Refit | None:
-    """A fit with another period from x, first by known derivatives; ``None`` where it diverges.
+def _with_longer_period(evaluator: Evaluator, x: torch.Tensor, longer: float) -> torch.Tensor:
+    """What a fit finds where a loop that holds its torque has a period that is longer by h [s], normalised (size,).
+
+    Seen h / 2 later, the motion takes away kp h / 2 of viscous friction and kd h / 2 of armature, to first order.
 
     Args:
-        x: Where it begins, normalised (size,).
+        evaluator: Of the problem.
+        x: What it finds with the shorter period, normalised (size,).
+    """
+    env, space = evaluator.rollout(1).env, evaluator.space
+    physical = space.to_physical(x)
+    for name, gain in zip(("viscous_friction", "armature"), loop_gains(env, evaluator.dataset.recordings), strict=True):
+        for joint, each in zip(env.scene["robot"].joint_names, gain.tolist(), strict=True):
+            if (label := f"{name}/{joint}") in space.labels:
+                physical[space.labels.index(label)] += each * longer / 2
+    return space.to_normalised(physical.clamp(space.lower, space.upper))
+
+
+def _refitted(
+    other: Problem, problem: Problem, x: torch.Tensor, longer: float, there: Jacobian, phases: FreePhases | None
+) -> _Refit | None:
+    """A fit with another period, first by known derivatives; ``None`` where it diverges.
+
+    Args:
+        x: The end of a fit, normalised (size,).
+        longer: By how much the other period is longer than that of this end [s].
         phases: What the residuals have taken out of free phases.
     """
     evaluator, space = other.evaluator_like(problem), problem.space
     evaluator.phases = phases
-    begin = evaluator.residuals(space.to_physical(x)[None])
+    starts = (x, _with_longer_period(evaluator, x, longer))
+    begins = [evaluator.residuals(space.to_physical(each)[None]) for each in starts]
+    best = int(torch.cat([each.score for each in begins]).nan_to_num(nan=math.inf).argmin())
+    x, begin = starts[best], begins[best]
     if not bool(begin.score.isfinite()):
         return None
     x, near, is_end = by_chords(evaluator, x, replace(there, residuals=begin), _LEFT)

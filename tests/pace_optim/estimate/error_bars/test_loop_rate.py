@@ -56,7 +56,7 @@ def test_a_rate_that_fits_best_is_compared_with_the_others_too():
 
 def test_a_rate_is_fitted_to_its_end_where_the_derivatives_of_the_fit_do_not_serve():
     """A step that gained nothing passed for an end: the right rate was refused, and wrong values had small bars."""
-    problem = recorded_at(0.001).with_drive_dt(0.0005)
+    problem = recorded_at(0.001).with_loop(0.0005)
     problem = dataclasses.replace(problem, assumed_loop=problem.loop_dt)
     x, known = fitted(problem)
     shown = ~np.isnan(known.uncertainty.std)
