@@ -157,10 +157,10 @@ def loop_rates(
 ) -> LoopRates | None:
     """Compare the rates that the loops may have, at a fit with one of them.
 
-    All are simulated with one physics step and fitted again, by the fit's derivatives as long as they serve. Each begins
-    at the end of the one nearest to it, or where a later loop moves that, whichever is better. Residuals and values
-    between the shortest simulated periods follow by the polynomial through these. With r the residuals of a candidate
-    and d = r - r' their difference to the best one's,
+    All are simulated with one physics step and fitted again, by the fit's derivatives as long as they serve. Each
+    begins at the end of the one nearest to it, or where a later loop moves that, whichever is better. Residuals and
+    values between the shortest simulated periods follow by the polynomial through these. With r the residuals of a
+    candidate and d = r - r' their difference to the best one's,
 
         χ² = (r·r - r'·r') d·d / (dᵀ Σ d)
 
