@@ -307,7 +307,7 @@ class Optimization:
             end = other.begin([start])
             if end.score < least.score:
                 found, least = other, end
-        if found is None or best.score - least.score <= UNEXPLAINED * (least.score - noise):
+        if found is None or not self._explains_more(least.score, best.score):
             return best
         self._search_on(found)
         return least
@@ -321,7 +321,7 @@ class Optimization:
         return jacobian
 
     def _by_known_derivatives(self, other: WayDown, best: Descent, there: Jacobian) -> torch.Tensor | None:
-        """Where steps by the derivatives of the best end on pieces lead on another way; ``None`` if to no lower end."""
+        """Where steps by the derivatives of the best end on pieces lead on another way; ``None`` if not further."""
         pieces = other.pieces
         pieces.phases = self.way.pieces.phases
         begin = self._look(pieces, best.x[None])
@@ -331,7 +331,11 @@ class Optimization:
             pieces,
             lambda: by_chords(pieces, best.x, replace(there, residuals=begin), other.cfg.on_pieces.score_tolerance),
         )
-        return None if is_end and float(near.residuals.score[0]) >= best.score else x
+        return None if is_end and not self._explains_more(float(near.residuals.score[0]), best.score) else x
+
+    def _explains_more(self, score: float, before: float) -> bool:
+        """Whether a score is below another by what matters beside the noise."""
+        return before - score > UNEXPLAINED * (score - noise_score(self.problem))
 
     def with_loop(self, period: float, x: torch.Tensor) -> Outcome:
         """Go on with loops of another period [s], near where a fit of pieces with it ends, normalised (size,)."""

@@ -9,7 +9,7 @@ from problems import BENCH, CALM, chirp, env_cfg, make_problem, record, replayed
 
 from pace_envs.task_source import EnvironmentRecord
 from pace_optim.estimate.error_bars.assessment import assess
-from pace_optim.estimate.error_bars.loop_rate import LoopRates, _against, _lagrange, loop_rates
+from pace_optim.estimate.error_bars.loop_rate import LoopRates, _against, _lagrange, _with_longer_period, loop_rates
 from pace_optim.estimate.least_squares import LeastSquaresCfg, least_squares
 from pace_optim.identification.conclude import conclude
 from pace_optim.identification.optimization import Optimization
@@ -81,6 +81,30 @@ def test_the_error_bars_hold_a_rate_that_a_log_with_gains_does_not_state(physics
     assert (np.abs(problem.space.to_physical(x).numpy() - truth) > 5 * known.uncertainty.std).any()
     assert (np.abs(rates.value_at(0.001) - truth) < 4 * known.uncertainty.std).all()
     assert 0.001 in rates.allowed
+
+
+def test_a_later_loop_takes_away_viscous_friction_and_armature():
+    """Seen h / 2 late, kp q and kd v lack kp h / 2 v and kd h / 2 a."""
+    problem = recorded_at(0.0025)
+    space, h = problem.space, 0.001
+    x = space.to_normalised(space.from_dict(CALM))
+    moved = space.to_physical(_with_longer_period(problem.evaluator(), x, h)) - space.to_physical(x)
+    wanted = space.from_dict({**dict.fromkeys(CALM, 0.0), "viscous_friction": 85.0 * h / 2, "armature": 0.6 * h / 2})
+    np.testing.assert_allclose(moved, wanted, atol=1e-12)
+
+
+def test_another_rate_that_explains_no_more_is_not_descended_with(tmp_path):
+    """Where physics is missing, half of a fit's time went there."""
+    problem = recorded_at(0.0025)
+    own = problem.dataset.recordings[0]
+    sway = 1e-3 * np.sin(5.0 * own.time)[:, None]
+    told = dataclasses.replace(own, dof_pos=own.dof_pos + sway, drive=own.drive)
+    problem = dataclasses.replace(make_problem(told), assumed_loop=problem.loop_dt)
+    settings = FitSettings(task=BENCH, optimizer="least_squares", log_dir=str(tmp_path), check_consistency=False)
+    run = Optimization(settings, problem, RunFolder(tmp_path), ProgressLine())
+    run.run()
+    assert run.descents[0].score > 10 * 1e-4**2
+    assert not [each.stage for each in run.descents if each.stage.startswith("loop")]
 
 
 def test_a_fit_goes_on_with_loops_of_another_rate_that_explain_more(tmp_path):
