@@ -81,9 +81,10 @@ def read_urdf(text: str, path: Path, *, touches: bool = False) -> UrdfFacts:
         raise ValueError(f"{path} is no readable XML: {error}.") from None
     if any("xacro" in str(element.tag) for element in root.iter()):
         raise ValueError(f"{path} is a xacro, not yet a URDF. Expand it first: xacro {path.name} > robot.urdf")
+    repeated = _keep_first(root)
     _check_numbers(root, path)
     meshes = _without_meshes(root, path if touches else None)
-    notes = [*_hold_what_floats(root), *_give_possible_inertias(root, path)]
+    notes = [*repeated, *_hold_what_floats(root), *_give_possible_inertias(root, path)]
     if meshes and touches:
         notes.append(
             f"Collision meshes without effect: {listed(meshes, 3)}. Expected {', '.join(_READABLE)} files beside the "
@@ -113,6 +114,27 @@ def _with_declared_prefixes(text: str) -> str:
     used = set(re.findall(r"[<\s/]([A-Za-z_][\w.-]*):[\w.-]+\s*(?:=|/?>|\s)", re.sub(r'"[^"]*"', '""', text)))
     unknown = sorted(prefix for prefix in used - {"xml", "xmlns"} if f"xmlns:{prefix}" not in text)
     return re.sub(r"<robot\b", " ".join(["<robot", *(f'xmlns:{p}="{p}"' for p in unknown)]), text, count=1)
+
+
+def _keep_first(root: ElementTree.Element) -> list[str]:
+    """Keep the first of elements that a link or joint has once, as ROS does; returns a note on the others."""
+    told: dict[str, list[str]] = {}
+    for owner in (*root.findall("link"), *root.findall("joint")):
+        for parent in (owner, *owner):
+            for tag in sorted(_ONCE.intersection(child.tag for child in parent)):
+                for repeated in parent.findall(tag)[1:]:
+                    parent.remove(repeated)
+                    told.setdefault(tag, []).append(owner.get("name", ""))
+    return [
+        f"Stated twice, the first is used: <{tag}> of {listed(list(dict.fromkeys(names)), 3)}."
+        for tag, names in told.items()
+    ]
+
+
+_ONCE = frozenset(
+    {"inertial", "origin", "mass", "inertia", "geometry", "parent", "child", "axis", "limit", "dynamics", "mimic"}
+)
+"""Elements of a URDF's link or joint, or of their parts, that stand once."""
 
 
 def _hold_what_floats(root: ElementTree.Element) -> list[str]:

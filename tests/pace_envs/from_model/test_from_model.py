@@ -223,6 +223,17 @@ def test_an_inertia_that_no_body_can_have_becomes_the_nearest_possible_one(tmp_p
     env.close()
 
 
+def test_of_elements_that_stand_twice_the_first_is_used(tmp_path):
+    """As ROS does; MuJoCo refuses such files."""
+    thigh = re.search(r"<inertial><origin.*?</inertial>", URDF, re.DOTALL)[0]
+    cfg = cfg_of(tmp_path, URDF.replace(thigh, thigh + '<inertial><mass value="90"/></inertial>'), "twice.urdf")
+    assert "Stated twice, the first is used: <inertial> of thigh." in cfg.sim2real.notes
+    env, once = made(cfg), made(cfg_of(tmp_path, URDF, "once.urdf"))
+    assert env.sim.model.body("thigh").mass == once.sim.model.body("thigh").mass
+    env.close()
+    once.close()
+
+
 def test_a_link_without_mass_between_joints_is_a_point_and_a_robot_without_any_is_refused(tmp_path):
     thigh = re.search(r"<inertial><origin.*?</inertial>", URDF, re.DOTALL)[0]
     cfg = cfg_of(tmp_path, URDF.replace(thigh, ""), "a.urdf")
