@@ -106,7 +106,6 @@ class WayDown:
         """Go all the way; returns the best descent on the whole recordings.
 
         Args:
-            starts: Normalised vectors, (size,).
             search: Searches the pieces with a budget of simulations around a vector; returns starts.
         """
         if not self.is_on_whole:

@@ -346,7 +346,6 @@ class Optimization:
         """Go on from the end of a fit at half its physics step, where that shows.
 
         Args:
-            there: Its residuals (m = 1).
             change: How they would change without a step, (K, R, n) [rad]; ``None``: that is not known.
 
         Returns:

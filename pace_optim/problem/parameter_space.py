@@ -215,7 +215,6 @@ class ParameterSpace:
         """Write one vector per environment to the simulation and its drives.
 
         Args:
-            physical: (num_envs, size).
             per_joint: Values per joint of shared parameters, {name: (num_envs, n)}.
         """
         for parameter in self.parameters:

@@ -138,7 +138,6 @@ def motors_of_logs(
 
     Args:
         task: As the command line has it.
-        files: Recordings and logs.
         columns: Column map of the logs among them.
     """
     if (stated := stated_couplings(files)) or not is_model_file(task):
@@ -167,7 +166,6 @@ def conform_all(
     Args:
         recordings: As :func:`read_logs` reads them.
         env: The robot, its other joints held.
-        control_dt: Control step [s].
         strict: As for :func:`read_logs`.
     """
     robot, known = env.scene["robot"], known_robot(env)

@@ -60,7 +60,6 @@ def _fit_along(
     """The joints along a reference that follows the model, and the model fitted there.
 
     Args:
-        fitted: Where to begin.
         along: Makes the reference: ``measured_path`` or ``reference_path``.
         model_effects: Effects whose influence on the rigid bodies is wanted.
     """

@@ -218,7 +218,6 @@ class Fits:
         Models that the control step shows to be far behind the best one on every joint stay where it left them.
 
         Args:
-            starts: Models and where they start.
             rough: Whether to go on over wide steps where narrow ones have led.
         """
         cfg, coarse = self.cfg, problem.coarse()
@@ -290,8 +289,6 @@ class Fits:
         with more damping. Joints do not influence each other, so that one row serves all of them.
 
         Args:
-            starts: Models and where they start.
-            max_iteration: Largest number of iterations.
             keep_jacobian: Whether the last Jacobian is kept.
             part: Only so much of the beginning of the recordings is simulated.
             rough: Whether derivatives are taken over wide steps first.

@@ -264,7 +264,6 @@ class JointModel:
         effect (it has no null) where the parameter moves nothing.
 
         Args:
-            x: Normalised, (n, P).
             moves: Which entries move their joint, (n, P) bool; ``None``: not known, and only sizes count.
         """
         result = torch.zeros_like(x, dtype=torch.bool)
@@ -346,7 +345,6 @@ def found_effects(model: JointModel, joint_names: Sequence[str], order: Sequence
     """The effects that joints have.
 
     Args:
-        model: The model that has them.
         order: Which comes first; none keeps the model's order.
     """
     result = []

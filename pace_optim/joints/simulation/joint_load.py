@@ -203,11 +203,6 @@ class LinkStates:
             M_jj = tr(S' S J),    τ_j = tr(S' A J),    A = V̇ + V V
 
         where V̇ has the acceleration less gravity.
-
-        Args:
-            of: The changes.
-            direct: As for :meth:`feel`.
-            own: As for it.
         """
         inertia, torque, load = np.zeros((3, *own.shape))
         velocity, at_rest = self._of_bodies
@@ -297,7 +292,6 @@ class Links:
             I_j = (T' M T)_jj,    f_j = I_j a_j - [T' (M a + b - s)]_j
 
         Args:
-            motion: Of T intervals.
             changes: What a unit of effects' parameters changes of links.
         """
         shape = (*motion.qpos.shape[:2], len(self.columns))

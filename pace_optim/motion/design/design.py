@@ -112,7 +112,6 @@ def optimize_motion(
         x: Where the parameters are expected to be, normalised (size,).
         min_frequency: Lower end of the widest band [Hz].
         max_frequency: Upper end of the widest band [Hz].
-        control_dt: Time between two targets [s].
         duration: Of the trajectory [s]; ``None`` means the excitation's usual one.
     """
     cfg = cfg or DesignCfg()

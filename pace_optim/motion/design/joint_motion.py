@@ -137,7 +137,6 @@ def command(
     """The targets of all joints, each its own motion; faster than its drive, a joint's amplitude is made smaller.
 
     Args:
-        control_dt: Time between two targets [s].
         duration: Of the trajectory [s]; ``None`` means the excitation's usual one.
 
     Returns:
@@ -190,7 +189,6 @@ def within_speed(unoptimized: Trajectory, all_rooms: Sequence[Room], control_dt:
 
     Args:
         unoptimized: The motion; it starts at the centre of every joint.
-        control_dt: Time between two targets [s].
     """
     if unoptimized.has_jumps:
         return unoptimized

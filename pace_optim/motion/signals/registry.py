@@ -36,8 +36,6 @@ def register_excitation(
     """Decorate a function that makes an excitation's trajectories.
 
     Args:
-        name: Its name on the command line.
-        description: What it is, in a few words.
         duration: Usual duration of each trajectory [s].
 
     Raises:
@@ -86,7 +84,6 @@ def make_excitation(
 
     Args:
         name: One of ``excitations()``.
-        control_dt: Time between two targets [s].
         duration: Duration of each trajectory [s]; ``None`` means the excitation's usual one.
         min_frequency: Lower end of the band [Hz].
         max_frequency: Upper end of the band [Hz].

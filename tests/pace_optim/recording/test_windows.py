@@ -95,7 +95,7 @@ def test_a_window_has_its_own_part_of_the_reference(bench):
             at = torch.arange(int(windows.dataset.sampled[:, w].nonzero()[-1]))
             assert torch.equal(windows.path.position[at, w], whole.position[at + start, r])
             assert torch.equal(windows.path.feel.torque[at, w], whole.feel.torque[at + start, r])
-            assert torch.equal(windows.path.stiffness[at, w], whole.stiffness[at + start, r])
+            assert torch.equal(windows.path.feel.stiffness[at, w], whole.feel.stiffness[at + start, r])
 
 
 def test_a_window_begins_at_the_measured_speed(bench):
