@@ -250,6 +250,11 @@ class Effect(Part):
             setattr(self, name, self.full(self.memory[name] if isinstance(self.memory, Mapping) else 0.0))
         self.prepare()
 
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> torch.Tensor:
+            """Parameters and memory are attributes, (rows, num_joints) each; a class need not declare them again."""
+
     # ---- what a subclass overrides -------------------------------------------------------------------------------
 
     def prepare(self) -> None:
