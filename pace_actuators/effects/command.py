@@ -23,6 +23,7 @@ class CommandRateLimit(Effect):
     name = "command_rate_limit"
     stage = "command"
     memory = ("_target",)
+    _target: torch.Tensor
     parameters = (
         EffectParameter(
             name="velocity",
@@ -42,6 +43,7 @@ class CommandRateLimit(Effect):
     probes = ({"velocity": 8.0}, {"velocity": 4.0}, {"velocity": 2.0}, {"velocity": 1.0}, {"velocity": 0.5})
     two_sided = False
     separates = "a larger and faster motion"
+    velocity: torch.Tensor
 
     def prepare(self) -> None:
         """Largest move per control step."""
@@ -68,6 +70,8 @@ class CommandAccelerationLimit(Effect):
     name = "command_acceleration_limit"
     stage = "command"
     memory = ("_target", "_speed")
+    _target: torch.Tensor
+    _speed: torch.Tensor
     parameters = (
         EffectParameter(
             name="acceleration",
@@ -89,6 +93,7 @@ class CommandAccelerationLimit(Effect):
     separates = "a larger and faster motion"
     profile_dt: ClassVar[float] = 0.00125
     """Longest step of the profile [s]."""
+    acceleration: torch.Tensor
 
     def prepare(self) -> None:
         """Steps of the profile in a control step, and what one adds to the speed."""
@@ -118,6 +123,7 @@ class CommandFilter(Effect):
     name = "command_filter"
     stage = "command"
     memory = ("_target",)
+    _target: torch.Tensor
     parameters = (EffectParameter(name="time_constant", unit="s", lower=0.0, upper=0.2, null=0.0, start=0.01),)
     equation = "T dx/dt + x = q*, the controller follows x"
     part = "the firmware's filter or interpolation of commands"
@@ -126,6 +132,7 @@ class CommandFilter(Effect):
     probes = ({"time_constant": 0.003}, {"time_constant": 0.01}, {"time_constant": 0.04})
     two_sided = False
     separates = "steps, whose rounding a pure delay does not have"
+    time_constant: torch.Tensor
 
     def prepare(self) -> None:
         """Weight of a command in the target, one control step after it."""
@@ -168,6 +175,7 @@ class OtherDelay(Effect):
     two_sided = False
     twins = ("measurement_delay",)
     separates = "recordings at another proportional gain"
+    delay: torch.Tensor
 
     def prepare(self) -> None:
         """Lags in the steps of the path: torques pass at every physics step, targets at every run of the controller."""
@@ -203,6 +211,7 @@ class ProportionalGain(Effect):
     probes = ({"gain": 1.02}, {"gain": 0.4}, {"gain": 2.5})
     scales = "proportional gain"
     separates = "recordings at another gain, and a known added mass"
+    gain: torch.Tensor
 
     def controller(self, s: DriveState) -> None:
         """Scale kp."""
@@ -223,6 +232,7 @@ class DerivativeGain(Effect):
     probes = ({"gain": 1.05}, {"gain": 0.3}, {"gain": 3.0})
     scales = "derivative gain"
     separates = "recordings at another derivative gain"
+    gain: torch.Tensor
 
     def controller(self, s: DriveState) -> None:
         """Scale kd."""
@@ -248,6 +258,7 @@ class GravityCompensation(Effect):
     probes = ({"share": 0.1},)
     reads_load = True
     separates = "a motion fast enough to separate weight from inertia, and a recording without the feed-forward"
+    share: torch.Tensor
 
     def effort_command(self, s: DriveState) -> None:
         """Add what holds that part of the load."""
@@ -265,6 +276,8 @@ class FastLoop(Effect):
     name = "fast_loop"
     stage = "controller"
     memory = ("_seen", "_speed")
+    _seen: torch.Tensor
+    _speed: torch.Tensor
     parameters = (
         EffectParameter(
             name="share", unit="1", lower=0.0, upper=1.0, null=0.0, start=0.5, possible=(0.0, 1.0),
@@ -278,6 +291,7 @@ class FastLoop(Effect):
     probes = ({"share": 0.5}, {"share": 1.0})
     two_sided = False
     separates = "recordings at another proportional gain"
+    share: torch.Tensor
 
     def controller(self, s: DriveState) -> None:
         """Remember what it sees."""
@@ -304,6 +318,7 @@ class IntegralGain(Effect):
     name = "integral_gain"
     stage = "controller"
     memory = ("_integral",)
+    _integral: torch.Tensor
     parameters = (
         EffectParameter(name="gain", unit="N m/(rad s)", lower=0.0, upper=1000.0, null=0.0, start=10.0, meaning="ki"),
         EffectParameter(
@@ -324,6 +339,8 @@ class IntegralGain(Effect):
     probes = ({"effort": 100.0}, {"effort": 5.0}, {"effort": 1.0})
     two_sided = False
     separates = "a staircase that holds each of its steps longer"
+    gain: torch.Tensor
+    effort: torch.Tensor
 
     def prepare(self) -> None:
         """What an error adds in a control step."""

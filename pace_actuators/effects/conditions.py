@@ -26,6 +26,8 @@ class _OfCondition(Effect):
     """What follows a condition of the drive; where nothing was logged, that is :meth:`usual`."""
 
     memory = ("_first", "_rate", *(f"_place_{k}" for k in range(_PLACES)))
+    _first: torch.Tensor
+    _rate: torch.Tensor
 
     def usual(self) -> torch.Tensor:
         """The condition at which it does nothing, (rows, num_joints)."""
@@ -77,6 +79,7 @@ class ThermalFriction(_OfCondition):
     looks = "the hysteresis loop becomes narrower as the drive warms up"
     source = "Bittencourt, Gunnarsson 2012, static friction in a robot joint: load and temperature"
     separates = "the same motion again, cold and warm"
+    slope: torch.Tensor
 
     def friction(self, s: DriveState) -> None:
         """Scale both frictions."""
@@ -98,6 +101,7 @@ class ThermalTorque(_OfCondition):
     looks = "the joint sags and slows down as the motor warms up"
     source = "magnets lose 0.1 to 0.2 % of their flux per °C"
     separates = "the same motion again, cold and warm"
+    slope: torch.Tensor
 
     def drive(self, s: DriveState) -> None:
         """Scale the torque."""
@@ -128,6 +132,8 @@ class SupplyVoltage(_OfCondition):
     source = "a bridge that is switched: its mean voltage is a share of the supply's"
     probes = tuple({"nominal": u} for u in (7.0, 12.0, 24.0, 48.0))
     separates = "the same motion again with another voltage"
+    share: torch.Tensor
+    nominal: torch.Tensor
 
     def usual(self) -> torch.Tensor:
         """The nominal voltage."""
@@ -142,6 +148,7 @@ class _Curve(_OfCondition, FreeForm):
     """A curve over a condition."""
 
     knots = _FEW
+    center: torch.Tensor
 
     def usual(self) -> torch.Tensor:
         """That of the knot 0."""

@@ -28,6 +28,7 @@ class TorqueGain(Effect):
     twins = ("payload",)
     scales = "torque"
     separates = "a recording with a known added mass"
+    gain: torch.Tensor
 
     def drive(self, s: DriveState) -> None:
         """Scale the torque."""
@@ -45,6 +46,8 @@ class TorqueFade(Effect):
     name = "torque_fade"
     stage = "drive"
     memory = ("_heat", "_first")
+    _heat: torch.Tensor
+    _first: torch.Tensor
     parameters = (
         EffectParameter(
             name="effort",
@@ -67,6 +70,8 @@ class TorqueFade(Effect):
     separates = "the same motion again after much work, and after a pause"
     least: ClassVar[float] = 0.1
     """What is left of the torque in any case."""
+    effort: torch.Tensor
+    time_constant: torch.Tensor
 
     def prepare(self) -> None:
         """What the heat takes, and how fast it follows."""
@@ -115,6 +120,7 @@ class SupplySag(Effect):
     probes = tuple({"effort": e} for e in (2000.0, 600.0, 200.0, 60.0, 20.0, 6.0, 2.0))
     two_sided = False
     separates = "another load; the supply's voltage in the log"
+    effort: torch.Tensor
 
     def drive(self, s: DriveState) -> None:
         """Give what is left."""
@@ -130,6 +136,7 @@ class DriveBandwidth(Effect):
     name = "drive_bandwidth"
     stage = "drive"
     memory = ("_torque",)
+    _torque: torch.Tensor
     parameters = (EffectParameter(name="time_constant", unit="s", lower=0.0, upper=0.03, null=0.0, start=0.002),)
     equation = "T dτ/dt + τ = clip(τ_cmd, ± τ_c)"
     part = "the current loop's tuning"
@@ -138,6 +145,7 @@ class DriveBandwidth(Effect):
     probes = ({"time_constant": 0.001}, {"time_constant": 0.005}, {"time_constant": 0.015})
     two_sided = False
     separates = "a known added mass, and recordings at another gain"
+    time_constant: torch.Tensor
 
     def prepare(self) -> None:
         """Weights of the command in the torque at the end of a step and in its mean over the step."""
@@ -175,6 +183,9 @@ class TorqueRipple(Effect):
     probes = tuple({"sine": a, "cosine": b} for a, b in ((0.1, 0.0), (0.0, 0.1)))
     comb = ("periods", "sine", "cosine")
     separates = "a slow motion over a wide range"
+    sine: torch.Tensor
+    cosine: torch.Tensor
+    periods: torch.Tensor
 
     def drive(self, s: DriveState) -> None:
         """Add the ripple."""
@@ -198,6 +209,7 @@ class TorqueLimit(Effect):
     probes = tuple({"effort": e} for e in (60.0, 40.0, 30.0, 20.0, 14.0, 10.0, 7.0, 5.0, 3.0, 1.0, 0.5, 0.3))
     two_sided = False
     separates = "a larger and faster motion"
+    effort: torch.Tensor
 
     def current_limit(self, s: DriveState) -> None:
         """Clip."""
@@ -227,6 +239,7 @@ class OffDamping(Effect):
     probes = ({"damping": 0.1}, {"damping": 1.0})
     acts_while_off = True
     separates = "a recording with the drive switched off while the joint moves"
+    damping: torch.Tensor
 
     def friction(self, s: DriveState) -> None:
         """Add it while the drive is off."""
@@ -246,6 +259,7 @@ class TorqueSpeedLimit(Effect):
     name = "torque_speed_limit"
     stage = "drive"
     memory = ("_speed",)
+    _speed: torch.Tensor
     parameters = (
         EffectParameter(
             name="velocity", unit="rad/s", lower=0.5, upper=60.0, null=_INFINITE, start=8.0, scale="log", meaning="v_0"
@@ -270,6 +284,8 @@ class TorqueSpeedLimit(Effect):
     )
     two_sided = False
     separates = "a larger and faster motion"
+    velocity: torch.Tensor
+    effort: torch.Tensor
 
     def prepare(self) -> None:
         """Stall torque, finite so that no speed makes it undefined."""

@@ -61,6 +61,7 @@ class CreepingFriction(Effect):
     two_sided = False
     smooths_friction = True
     memory = ("_before",)
+    _before: torch.Tensor
     parameters = (
         EffectParameter(name="velocity", unit="rad/s", lower=0.0, upper=0.5, null=0.0, start=0.02, meaning="v_s"),
     )
@@ -70,6 +71,7 @@ class CreepingFriction(Effect):
     source = "regularised Coulomb friction (e.g. Marques, Flores, Claro, Lankarani 2016); simulators' soft friction"
     probes = ({"velocity": 0.005}, {"velocity": 0.02}, {"velocity": 0.08}, {"velocity": 0.25})
     separates = _SEPARATES
+    velocity: torch.Tensor
 
     def prepare(self) -> None:
         """Where it acts."""
@@ -122,6 +124,7 @@ class SoftFriction(Effect):
     two_sided = False
     smooths_friction = True
     separates = _SEPARATES
+    time_constant: torch.Tensor
 
     def constraint(self, s: DriveState) -> None:
         """Let the simulator apply it."""

@@ -64,6 +64,7 @@ class FreeForm(Effect):
     kind: ClassVar[Literal["torque", "friction", "gain", "inertia"]] = "torque"
     """What it is: a torque or a friction, which is added, or what a torque or the inertia is multiplied by."""
     source = "piecewise linear; no physics behind it"
+    reach: torch.Tensor
 
     @classmethod
     def curve(cls, values: Mapping[str, float]) -> dict[str, list[float]]:
@@ -120,6 +121,7 @@ class TorqueOverPosition(FreeForm):
     equation = "τ + f(q)"
     looks = "the error goes with the position, up and down strokes alike"
     separates = "a staircase over the whole range"
+    center: torch.Tensor
 
     def transmission(self, s: DriveState) -> None:
         """Add it at the joint."""
@@ -197,6 +199,7 @@ class FrictionOverPosition(FreeForm):
     equation = "F = F_c + f(q), f = 0 at the center"
     looks = "the hysteresis loop is wider at some positions than at others"
     separates = "a slow triangle over the whole range"
+    center: torch.Tensor
 
     def friction(self, s: DriveState) -> None:
         """Change the level."""
@@ -269,6 +272,7 @@ class GainOverPosition(_Gain):
     equation = "τ -> (1 + f(q)) τ"
     looks = "the error goes with the torque, more at some positions than at others"
     separates = "a staircase over the whole range, with two loads"
+    center: torch.Tensor
 
     def over(self, s: DriveState) -> torch.Tensor:
         """Position."""
@@ -332,6 +336,7 @@ class InertiaOverPosition(FreeForm):
     reads_link = True
     changes_armature = True
     separates = "fast motions about several positions"
+    center: torch.Tensor
     across: ClassVar[float] = 0.05
     """Part of the reach over which the slope is taken."""
 

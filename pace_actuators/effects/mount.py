@@ -45,6 +45,12 @@ class MountCompliance(Effect):
         "_link": 0.0,
         "_total": 1.0,
     }
+    _angle: torch.Tensor
+    _speed: torch.Tensor
+    _joint_speed: torch.Tensor
+    _rest: torch.Tensor
+    _link: torch.Tensor
+    _total: torch.Tensor
     parameters = (
         EffectParameter(
             name="stiffness",
@@ -85,6 +91,9 @@ class MountCompliance(Effect):
     source = "two-inertia system"
     probes = tuple({"stiffness": k, "inertia": j} for k in (4000.0, 1000.0, 400.0) for j in (0.4, 1.5))
     separates = "higher frequencies, and the mount held by hand"
+    stiffness: torch.Tensor
+    damping: torch.Tensor
+    inertia: torch.Tensor
 
     def prepare(self) -> None:
         """Where it acts."""
