@@ -77,7 +77,6 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
     @property
     def takes_masks(self) -> bool:
         """Whether all terms can be reset by a mask instead of indices: those of this package can."""
-        loops = any(robot.closed_loops is not None for robot in self.scene.articulations.values())
         managers = (
             self.action_manager,
             self.command_manager,
@@ -87,7 +86,7 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
             self.reward_manager,
             self.termination_manager,
         )
-        return not loops and all(manager.takes_masks for manager in managers)
+        return self.scene.robot.closed_loops is None and all(manager.takes_masks for manager in managers)
 
     @property
     def can_be_captured(self) -> bool:
