@@ -76,7 +76,7 @@ def use_identified(
     cfg.scene.robot.links = {**cfg.scene.robot.links, **drives.links}
     if cfg.sim.device == "cpu" and any(drive.second_order for drive in groups.values()):
         cfg.sim.integrator = "leapfrog"
-        at = min([drives.at.control_dt, *drives.drive.get("drive_dt", {}).values()])
+        at = _loop_dt(drives)
         if abs(cfg.sim.dt - at) < 1e-9 and drives.at.physics_dt < at * (1 - 1e-6) and not own_step:
             set_physics_dt(cfg, drives.at.physics_dt)
     if randomize_std is not None:
@@ -157,7 +157,7 @@ def set_identified_step(cfg: ManagerBasedEnvCfg, identified: IdentifiedDrives | 
         What was changed, in words.
     """
     drives, before = IdentifiedDrives.of(identified), cfg.sim.dt
-    dt = min([drives.at.control_dt, *drives.drive.get("drive_dt", {}).values()])
+    dt = _loop_dt(drives)
     whole = cfg.sim.dt * cfg.decimation / dt
     if dt >= before * (1 - 1e-6) or abs(whole - round(whole)) > 1e-6:
         return None
@@ -176,12 +176,17 @@ def step_note(cfg: ManagerBasedEnvCfg, drives: IdentifiedDrives, before: float) 
     step, control = cfg.sim.dt, drives.at.control_dt
     if step >= before * (1 - 1e-6):
         return ""
-    loop = max(step, min([control, *drives.drive.get("drive_dt", {}).values()]))
+    loop = max(step, _loop_dt(drives))
     note = f"drives {1e3 * loop:g} ms, physics {1e3 * step:g} ms, as in the fit (task: {1e3 * before:g} ms)"
     if step >= control * (1 - 1e-6):
         return note
     cure = f"fit again with --physics_dt {control:g} --drive_dt {control:g}"
     return f"{note}. Fine steps are slow: to train faster, {cure} (docs/training.md)"
+
+
+def _loop_dt(drives: IdentifiedDrives) -> float:
+    """Period of the fastest drive's loop in the identification [s]."""
+    return min([drives.at.control_dt, *drives.drive.get("drive_dt", {}).values()])
 
 
 def _other_drives(robot: ArticulationCfg, drives: IdentifiedDrives) -> list[str]:

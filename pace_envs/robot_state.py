@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -91,9 +91,9 @@ class JointLayout:
     """First columns of a floating base in ``qpos`` and ``qvel``; ``None`` for a fixed one."""
     driven: DrivenJoints
     """The joints that they are, or that motors among them move."""
-    passive_names: tuple[str, ...] = ()
+    passive_names: tuple[str, ...]
     """Hinge and slide joints of the model that are not among them: they move as their loads and loops do."""
-    passive_columns: torch.Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.long))
+    passive_columns: torch.Tensor
     """Column of each passive joint in ``qpos``."""
 
     @classmethod

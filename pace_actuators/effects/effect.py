@@ -253,7 +253,7 @@ class Effect(Part):
     if TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> torch.Tensor:
-            """Parameters and memory are attributes, (rows, num_joints) each; a class need not declare them again."""
+            """Parameters are attributes, (rows, num_joints) each: a class need not declare them again."""
 
     # ---- what a subclass overrides -------------------------------------------------------------------------------
 

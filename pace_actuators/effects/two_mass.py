@@ -78,9 +78,6 @@ class _TwoMass(Effect):
     numerical_damping: ClassVar[float] = 0.05
     """Part of k h below which c does not fall (half of what it says is added there, so that a fit feels it): what is
     too fast for the step dies out, a resonance inside the band does not."""
-    stiffness: torch.Tensor
-    damping: torch.Tensor
-    encoder_side: torch.Tensor
 
     def switched_on(self) -> torch.Tensor:
         """Where motor and link are two, (rows, num_joints) bool."""
@@ -261,8 +258,6 @@ class JointElasticity(_TwoMass):
     source = "Spong 1987, flexible joint"
     probes = tuple({"stiffness": k, "encoder_side": e} for k in (5000.0, 1500.0, 500.0, 200.0) for e in (0.0, 1.0))
     separates = "higher frequencies, and a known added mass"
-    stiffness: torch.Tensor
-    damping: torch.Tensor
 
     def switched_on(self) -> torch.Tensor:
         """Where the stiffness is finite."""
@@ -320,9 +315,6 @@ class Backlash(_TwoMass):
     probes = tuple({"gap": g, "encoder_side": e} for g in (0.002, 0.008, 0.025) for e in (0.0, 1.0))
     separates = "several amplitudes, and a 1.5 times larger proportional gain"
     numerical_damping = 0.3  # a contact shorter than a few steps would push harder on the way out than on the way in
-    gap: torch.Tensor
-    stiffness: torch.Tensor
-    damping: torch.Tensor
 
     def switched_on(self) -> torch.Tensor:
         """Where there is a gap."""
