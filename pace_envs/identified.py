@@ -9,8 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import mujoco
-
 from pace_actuators import IdentifiedDrives, PaceDCMotorCfg, match_names, resolve_joint_values
 from pace_actuators.drive_result import CURE
 from pace_actuators.effects import effect_cfgs
@@ -21,6 +19,7 @@ from pace_envs import mdp
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.manager_based_env import ManagerBasedEnvCfg
 from pace_envs.managers import EventTermCfg
+from pace_envs.motor_coordinates import SINGLE
 from pace_envs.registration import set_physics_dt
 from pace_envs.robot_spec import load_robot_spec
 from pace_envs.task_source import EnvironmentRecord
@@ -33,7 +32,6 @@ _SAME = 0.01
 """Relative difference of gains and limits that does not count."""
 _MOST = 4
 """Labels that a sentence names, at most."""
-_DRIVEN = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
 def use_identified(
@@ -271,7 +269,7 @@ def _with_recorded_gains(robot: ArticulationCfg, drives: IdentifiedDrives) -> Ar
 
 def _groups(robot: ArticulationCfg) -> Iterator[tuple[str, PaceDCMotorCfg, list[str]]]:
     """Each group of drives with its name and its joints, in its order."""
-    names = robot.joint_order or [j.name for j in load_robot_spec(robot).joints if j.type in _DRIVEN]
+    names = robot.joint_order or [j.name for j in load_robot_spec(robot).joints if j.type in SINGLE]
     for group, drive in robot.actuators.items():
         yield group, drive, [names[i] for found in match_names(drive.joint_names_expr, names) for i in found]
 

@@ -16,7 +16,7 @@ from pace_actuators.text import listed
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.closed_loops import ClosedLoops
 from pace_envs.indexing import EnvIds, JointIds, assign, checked_values, find_names, indices, zeros_like
-from pace_envs.motor_coordinates import DrivenJoints, MotorCoordinates, fixed_tendon, joint_ranges
+from pace_envs.motor_coordinates import SINGLE, DrivenJoints, MotorCoordinates, fixed_tendon, joint_ranges
 from pace_envs.quaternions import down, multiply, rotate_inverse
 from pace_envs.simulation import Simulation
 
@@ -114,7 +114,7 @@ class JointLayout:
             name, kind = model.joint(j).name, mujoco.mjtJoint(int(model.jnt_type[j]))
             if kind == mujoco.mjtJoint.mjJNT_FREE:
                 root = (int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j]))
-            elif kind in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+            elif kind in SINGLE:
                 single[name] = j
             elif joint_order is None or name in joint_order:
                 raise ValueError(f"The joint {name!r} is a ball joint. Only hinge and slide joints have drives.")
