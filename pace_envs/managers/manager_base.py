@@ -85,9 +85,9 @@ Number = float | torch.Tensor
 """A number to log; on a GPU a tensor without dimensions, so that nothing waits for it before it is written."""
 
 
-def as_number(value: torch.Tensor) -> Number:
-    """A tensor without dimensions as a number to log."""
-    return value.item() if value.device.type == "cpu" else value
+def as_numbers(log: Mapping[str, torch.Tensor]) -> dict[str, Number]:
+    """Tensors without dimensions as numbers to log."""
+    return {name: value.item() if value.device.type == "cpu" else value for name, value in log.items()}
 
 
 def state_only(func: Callable[..., Any]) -> Callable[..., Any]:
