@@ -26,6 +26,7 @@ Source: Newmark 1959; Spong 1987 for the flexible joint.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import ClassVar
 
 import torch
@@ -46,6 +47,20 @@ added, which ends it."""
 _HARDEST = 1e-4
 """Least R' / A of soft friction, as MuJoCo has it."""
 
+_STIFFNESS = EffectParameter(
+    name="stiffness",
+    unit="N m/rad",
+    lower=80.0,
+    upper=2e4,
+    null=float("inf"),
+    start=1000.0,
+    scale="log",
+    meaning="k",
+    follows_loop=True,
+)
+_DAMPING = EffectParameter(
+    name="damping", unit="N m s/rad", lower=0.0, upper=20.0, null=None, start=0.5, meaning="c", follows_loop=True
+)
 _SIDE = EffectParameter(
     name="encoder_side",
     unit="1",
@@ -228,30 +243,7 @@ class JointElasticity(_TwoMass):
     """Motor and link are joined by a spring and a damper, k and c."""
 
     name = "joint_elasticity"
-    parameters = (
-        EffectParameter(
-            name="stiffness",
-            unit="N m/rad",
-            lower=80.0,
-            upper=2e4,
-            null=float("inf"),
-            start=1000.0,
-            scale="log",
-            meaning="k",
-            follows_loop=True,
-        ),
-        EffectParameter(
-            name="damping",
-            unit="N m s/rad",
-            lower=0.0,
-            upper=20.0,
-            null=None,
-            start=0.5,
-            meaning="c",
-            follows_loop=True,
-        ),
-        _SIDE,
-    )
+    parameters = (_STIFFNESS, _DAMPING, _SIDE)
     equation = "J d²θ/dt² = τ - f - friction, link: + f, f = k (θ - q) + c (dθ/dt - dq/dt)"
     part = "belt, harmonic drive, long shaft"
     looks = "resonance and anti-resonance; the base fit is overdamped with parameters at their bounds"
@@ -285,27 +277,8 @@ class Backlash(_TwoMass):
     name = "backlash"
     parameters = (
         EffectParameter(name="gap", unit="rad", lower=0.0, upper=0.05, null=0.0, start=0.004),
-        EffectParameter(
-            name="stiffness",
-            unit="N m/rad",
-            lower=300.0,
-            upper=2e4,
-            null=None,
-            start=5000.0,
-            scale="log",
-            meaning="k",
-            follows_loop=True,
-        ),
-        EffectParameter(
-            name="damping",
-            unit="N m s/rad",
-            lower=0.0,
-            upper=20.0,
-            null=None,
-            start=5.0,
-            meaning="c",
-            follows_loop=True,
-        ),
+        replace(_STIFFNESS, lower=300.0, null=None, start=5000.0),
+        replace(_DAMPING, start=5.0),
         _SIDE,
     )
     equation = "as joint_elasticity with f = k dz(θ - q, ± gap/2)"
