@@ -10,6 +10,8 @@ from pace_actuators.memory import check_memory
 from pace_actuators.part import Part
 
 Interpolation = Literal["linear", "hold"]
+EnvIds = Sequence[int] | torch.Tensor | slice | None
+"""Environments: indices, a mask (num_envs,) bool, or ``None`` for all."""
 
 _LARGE = 1e7
 """Samples from where on it is looked whether there is memory for them."""
@@ -103,9 +105,7 @@ class DelayBuffer(Part):
         """Lags [steps]: one per environment, (num_envs,), or one per joint, (num_envs, num_joints)."""
         return self._lag[:, 0].clone() if self._lag.shape[1] == 1 else self._lag.clone()
 
-    def set_time_lag(
-        self, time_lag: float | torch.Tensor, env_ids: Sequence[int] | torch.Tensor | slice | None = None
-    ) -> None:
+    def set_time_lag(self, time_lag: float | torch.Tensor, env_ids: EnvIds = None) -> None:
         """Set the lag of all or some environments; the history is kept.
 
         Args:
@@ -148,7 +148,7 @@ class DelayBuffer(Part):
             self._lead = lead
             self._index_lags()
 
-    def reset(self, env_ids: Sequence[int] | torch.Tensor | slice | None = None) -> None:
+    def reset(self, env_ids: EnvIds = None) -> None:
         """Forget the history of all or some environments: indices, or (num_envs,) bool."""
         if self._on_device:
             self._age[slice(None) if env_ids is None else env_ids] = -1
