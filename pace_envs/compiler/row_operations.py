@@ -326,10 +326,10 @@ def _put(space: RowSpace, args: Sequence[Any], kwargs: dict[str, Any], target: A
         return None
     if columns is None:
         return on_elements(space, "copy", [field, value], {}, field)
-    index = _for_rows(space, columns)
-    if value.ndim > 2 or any(size not in (1, n) for size, n in zip(value.shape[::-1], index.shape[::-1], strict=False)):
+    place = _for_rows(space, columns)
+    if value.ndim > 2 or any(size not in (1, n) for size, n in zip(value.shape[::-1], place.shape[::-1], strict=False)):
         return None
-    return _entries_put(space, field, 1, index, value.expand(index.shape))
+    return _entries_put(space, field, 1, place, value.expand(place.shape))
 
 
 def _cells(
@@ -386,7 +386,8 @@ def _from_zero(writer: Writer, number: Node, size: int) -> Node:
 
 
 def _gathered(space: RowSpace, args: Sequence[Any], kwargs: dict[str, Any], target: Any) -> Plan:
-    return None if target is not None else _entries_taken(space, *args[:3], None)
+    table, dim, index = args[:3]
+    return None if target is not None else _entries_taken(space, table, dim, index, None)
 
 
 def _scattered(space: RowSpace, args: Sequence[Any], kwargs: dict[str, Any], target: Any) -> Plan:
