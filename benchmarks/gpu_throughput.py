@@ -72,7 +72,7 @@ class Motion:
         self._sim, self._step, self._decimation = env.sim, env.sim.step, env.cfg.decimation
         self._state = [env.sim.bind(name) for name in STATE]
         passive = [env.sim.expand(name) for name in PASSIVE]
-        drives = [drive for robot in env.scene.articulations.values() for drive in robot.actuators.values()]
+        drives = env.scene["robot"].actuators.values()
         self._inputs = [env.sim.qfrc_applied, *(passive if any(drive.changes_passive for drive in drives) else [])]
         self._states, self._given = list[list[torch.Tensor]](), list[list[torch.Tensor]]()
 

@@ -36,7 +36,7 @@ BASE_PARAMETERS: dict[str, BaseParameter] = {
     )
 }
 """All of them by name. Vectors and PACE's tensors have this order: append, never insert. One without ``mujoco`` needs a
-branch in ``Articulation.write_base_parameter_to_sim``."""
+writer in ``pace_envs.articulation``."""
 
 PER_JOINT = tuple(name for name, parameter in BASE_PARAMETERS.items() if not parameter.shared)
 """Those that every joint has."""

@@ -1,8 +1,7 @@
 """A delay of a real number of steps, one per environment."""
 
 import math
-from collections.abc import Callable, Hashable, Sequence
-from functools import partial
+from collections.abc import Hashable, Sequence
 from typing import Literal, NamedTuple
 
 import torch
@@ -11,6 +10,8 @@ from pace_actuators.memory import check_memory
 from pace_actuators.part import Part
 
 Interpolation = Literal["linear", "hold"]
+EnvIds = Sequence[int] | torch.Tensor | slice | None
+"""Environments: indices, a mask (num_envs,) bool, or ``None`` for all."""
 
 _LARGE = 1e7
 """Samples from where on it is looked whether there is memory for them."""
@@ -26,21 +27,6 @@ class Jump(NamedTuple):
 
     share: torch.Tensor
     """The part of the time that is before the change, (num_envs, 1 or num_joints)."""
-
-
-class _Rows:
-    """Rows of a storage for every head position, tabulated when one is asked for: most lags are replaced before."""
-
-    def __init__(self, tabulate: Callable[[], torch.Tensor]):
-        """Keep how to tabulate."""
-        self._tabulate = tabulate
-        self._table: torch.Tensor | None = None
-
-    def __getitem__(self, head: int) -> torch.Tensor:
-        """Those of a head position."""
-        if self._table is None:
-            self._table = self._tabulate()
-        return self._table[head]
 
 
 class DelayBuffer(Part):
@@ -119,9 +105,7 @@ class DelayBuffer(Part):
         """Lags [steps]: one per environment, (num_envs,), or one per joint, (num_envs, num_joints)."""
         return self._lag[:, 0].clone() if self._lag.shape[1] == 1 else self._lag.clone()
 
-    def set_time_lag(
-        self, time_lag: float | torch.Tensor, env_ids: Sequence[int] | torch.Tensor | slice | None = None
-    ) -> None:
+    def set_time_lag(self, time_lag: float | torch.Tensor, env_ids: EnvIds = None) -> None:
         """Set the lag of all or some environments; the history is kept.
 
         Args:
@@ -164,7 +148,7 @@ class DelayBuffer(Part):
             self._lead = lead
             self._index_lags()
 
-    def reset(self, env_ids: Sequence[int] | torch.Tensor | slice | None = None) -> None:
+    def reset(self, env_ids: EnvIds = None) -> None:
         """Forget the history of all or some environments: indices, or (num_envs,) bool."""
         if self._on_device:
             self._age[slice(None) if env_ids is None else env_ids] = -1
@@ -204,11 +188,8 @@ class DelayBuffer(Part):
         """
         if self._storage is None:
             raise ValueError("The delay has no sample yet: call compute first.")
-        samples = self._storage.view(self._length, self._num_envs, -1)
-        if not self._on_device:
-            return samples.roll(-self._head, dims=0)
-        back = (self._length - torch.arange(self._length, device=self._device)) % self._length
-        return torch.cat([self._seen(each.expand_as(self._row))[None] for each in back])
+        back = [0, *range(self._length - 1, 0, -1)]
+        return torch.stack([self._seen(self._rows(torch.full_like(self._row, steps))) for steps in back])
 
     def _push(self, data: torch.Tensor) -> None:
         """Put a sample into the ring."""
@@ -262,7 +243,7 @@ class DelayBuffer(Part):
         return Jump(rise, share.to(rise.dtype))
 
     def _index_lags(self) -> None:
-        """Tabulate, for every head position, the rows of the two samples around each lag."""
+        """Find the rows of the two samples around each lag."""
         self._total = lag = self._lag + self._lead if self._lead else self._lag
         whole = lag.ceil() if self.interpolation == "hold" else lag.floor()
         self._newer, self._older = self._rows(whole), self._rows(whole + 1)
@@ -273,7 +254,7 @@ class DelayBuffer(Part):
 
     def _index_parts(self) -> None:
         """The same for every part of a step: the newer and the older sample, and the older one's weight."""
-        self._at: dict[int, tuple[torch.Tensor | _Rows, torch.Tensor | _Rows, torch.Tensor | None]] = {}
+        self._at: dict[int, tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]] = {}
         self._switches: set[int] = set()
         if self.parts == 1 or self.interpolation == "hold":
             return
@@ -291,31 +272,23 @@ class DelayBuffer(Part):
     def _all(self, which: torch.Tensor) -> bool:
         return bool(which.all())
 
-    def _rows(self, steps: torch.Tensor) -> torch.Tensor | _Rows:
-        """What :meth:`_seen` takes for the samples so many steps back."""
-        return steps.long() if self._on_device else _Rows(partial(self._tabulated, steps))
+    def _rows(self, steps: torch.Tensor) -> torch.Tensor:
+        """What :meth:`_seen` takes for the samples so many steps back, (num_envs, 1 or num_joints)."""
+        if self._on_device:
+            return steps.long()
+        return torch.arange(self._num_envs)[:, None] - self._num_envs * steps.long()
 
-    @torch.inference_mode(False)  # the caller's mode may be another one later
-    def _tabulated(self, steps: torch.Tensor) -> torch.Tensor:
-        heads = torch.arange(self._length, device=self._device)[:, None]
-        envs = torch.arange(self._num_envs, device=self._device)
-        if steps.shape[1] == 1:
-            back = steps[:, 0].long()
-        else:
-            heads, back, envs = heads[..., None], steps.long(), envs[:, None]
-        return ((heads - back) % self._length) * self._num_envs + envs
-
-    def _seen(self, rows: torch.Tensor | _Rows) -> torch.Tensor:
+    def _seen(self, rows: torch.Tensor) -> torch.Tensor:
         """Samples of the past, (num_envs, num_joints).
 
         Args:
-            rows: Of :meth:`_rows`: on a GPU steps back, (num_envs, 1 or num_joints); else rows of the storage for every
-                head position, whole ones or, with a lag per joint, of single entries.
+            rows: Of :meth:`_rows`: on a GPU steps back; else rows of the storage while its first place has the newest
+                sample.
         """
         assert self._storage is not None  # a sample was pushed before
-        if isinstance(rows, _Rows):
-            index = rows[self._head]
-            return self._storage.index_select(0, index) if index.ndim == 1 else self._storage.gather(0, index)
+        if not self._on_device:
+            index = (rows + self._head * self._num_envs) % len(self._storage)
+            return self._storage.index_select(0, index[:, 0]) if index.shape[1] == 1 else self._storage.gather(0, index)
         history = self._storage.view(self._length, self._num_envs, -1)
         place = self._row - torch.minimum(rows, self._age)
         place = torch.where(place < 0, place + self._length, place)

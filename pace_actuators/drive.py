@@ -12,15 +12,13 @@ from typing import Any
 
 import torch
 
-from pace_actuators.delay_buffer import Jump
+from pace_actuators.delay_buffer import EnvIds, Jump
 from pace_actuators.drive_delays import DriveDelays
 from pace_actuators.effects import EffectCfg, EffectStack, effect_cfgs
 from pace_actuators.effects.effect import Conditions, Heat
 from pace_actuators.identified import delay_in_steps, step_notes
 from pace_actuators.pace_dc_motor_cfg import DriveParameters, PaceDCMotorCfg, calls_per_run
 from pace_actuators.part import Part
-
-EnvIds = Sequence[int] | torch.Tensor | slice | None
 
 _ROUNDING = 1e-3
 """Of a period: by so much a run may come early, as sums of steps are rounded."""

@@ -7,10 +7,9 @@ from typing import TypeVar
 
 import torch
 
-from pace_actuators.delay_buffer import DelayBuffer, Interpolation, Jump
+from pace_actuators.delay_buffer import DelayBuffer, EnvIds, Interpolation, Jump
 from pace_actuators.part import Part
 
-EnvIds = Sequence[int] | torch.Tensor | slice | None
 _Signal = TypeVar("_Signal", torch.Tensor, torch.Tensor | None)
 
 

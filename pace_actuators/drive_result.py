@@ -119,9 +119,11 @@ class DriveResult:
         if not self.joint_names or len(set(self.joint_names)) < len(self.joint_names):
             refuse(source, "joint_names must be a list of different names", CURE)
         for name, parameter in BASE_PARAMETERS.items():
-            self._expect(name, [ALL] if parameter.shared else self.joint_names, source)
-        for name, parameter in BASE_PARAMETERS.items():
-            for key, value in self.parameters[name].items():
+            entries = self.parameters.get(name, {})
+            keys = [ALL] if parameter.shared or ALL in entries else self.joint_names
+            if missing := [key for key in keys if key not in entries]:
+                refuse(source, f"{name} has no value for {', '.join(missing)}", CURE)
+            for key, value in entries.items():
                 if parameter.least is not None and value < parameter.least:
                     refuse(source, f"{name} of {key} is {value:g}, expected at least {parameter.least:g}", CURE)
         for name, values in self.drive.items():
@@ -142,12 +144,6 @@ class DriveResult:
                 CURE,
             )
         self._check_correlation(source)
-
-    def _expect(self, name: str, keys: Sequence[str], source: object) -> None:
-        """A parameter must have a value for each key, or one for all."""
-        entries = self.parameters.get(name, {})
-        if missing := [key for key in keys if key not in entries and ALL not in entries]:
-            refuse(source, f"{name} has no value for {', '.join(missing)}", CURE)
 
     def _check_correlation(self, source: object) -> None:
         if not self.correlation:

@@ -120,6 +120,22 @@ def import_named(module: str) -> ModuleType:
         sys.meta_path[:0] = recorded
 
 
+def import_reference(text: str, what: str) -> str:
+    """Import the module of what the user names, and return the text, good from any folder; a name alone stays.
+
+    Args:
+        text: ``module:Name``, ``path/to/file.py:Name``, or a name.
+        what: What was named, for messages.
+    """
+    if not (module := split_reference(text)[0]):
+        return text
+    try:
+        import_named(module)
+    except ValueError as error:
+        raise ValueError(f"{what}: {error}") from None
+    return absolute_reference(text)
+
+
 def import_recorded(module: str, code: CodeRecord, where: str, hint: str) -> ModuleType:
     """Import a module that a file names, if its code is what the file's record says.
 

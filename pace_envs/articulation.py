@@ -89,15 +89,9 @@ class Articulation(RobotState):
         values = self._sim.tensor(values)
         for actuator in self.actuators.values():
             pairs = [(k, wanted.index(j)) for k, j in enumerate(self.joints_of(actuator)) if j in wanted]
-            if not pairs:
-                continue
-            local, chosen = (list(each) for each in zip(*pairs, strict=True))
-            if name == "delay":
-                actuator.update_time_lags(values if values.shape[1] == 1 else values[:, chosen])
-            else:
-                bias = actuator.encoder_bias.clone()
-                bias[:, local] = values[:, chosen]
-                actuator.update_encoder_bias(bias)
+            if pairs:
+                local, chosen = (list(each) for each in zip(*pairs, strict=True))
+                _WRITERS[name](actuator, values if values.shape[1] == 1 else values[:, chosen], local)
 
     def add_body_mass(
         self,
@@ -241,9 +235,7 @@ class Articulation(RobotState):
                 local, chosen = zip(*pairs, strict=True)
                 joints = torch.tensor(local, device=self._sim.device)
                 here.set_parameter(parameter, values[here.rows][:, list(chosen)], joints=joints)
-            self._write_passive(actuator)
-            if here.overrides("write_model"):
-                self._write_model(actuator, here)
+            self._write_effect(actuator, here)
         if not found:
             raise ValueError(f"No drive has the effect {effect!r}. Present: {', '.join(self.effects) or 'none'}.")
 
@@ -255,6 +247,10 @@ class Articulation(RobotState):
         """
         for parameter, value in zip(effect.parameters, values.unbind(dim=-1), strict=True):
             effect.set_parameter(parameter.name, value)
+        self._write_effect(actuator, effect)
+
+    def _write_effect(self, actuator: PaceDCMotor, effect: Effect) -> None:
+        """Write what the simulator carries of a drive with an effect whose parameters have changed."""
         self._write_passive(actuator)
         if effect.overrides("write_model"):
             self._write_model(actuator, effect)
@@ -362,6 +358,20 @@ class Articulation(RobotState):
                 self._write(written, self._layout.dof_columns, True, joint_ids, env_ids)
                 setattr(actuator, name, torch.where(written[:, columns], whole[:, columns], own))
                 self._write_passive(actuator)
+
+
+def _write_bias(actuator: PaceDCMotor, bias: torch.Tensor, joints: list[int]) -> None:
+    whole = actuator.encoder_bias.clone()
+    whole[:, joints] = bias
+    actuator.update_encoder_bias(whole)
+
+
+def _write_delay(actuator: PaceDCMotor, delay: torch.Tensor, joints: list[int]) -> None:
+    actuator.update_time_lags(delay)
+
+
+_WRITERS = {"encoder_bias": _write_bias, "delay": _write_delay}
+"""What gives a drive the base parameters that its joints do not carry."""
 
 
 def _field(name: str) -> str:

@@ -11,6 +11,8 @@ import mujoco
 import numpy as np
 import torch
 
+from pace_envs.motor_coordinates import SINGLE
+
 _STEPS = 40
 """Newton steps from one posture to the next."""
 _LARGEST_STEP = 0.3
@@ -21,7 +23,6 @@ _RATTLES = 0.01
 """A joint that the loops leave free leans on its stop on average, if it is nearer to it than this part of its range."""
 _FOLLOWS = 1e-6
 """Speeds follow when their constraints are met within this part of the driven joints' speed."""
-_SINGLE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 _TURN = 1e-4
 """Largest motion of a joint over which the change of T is taken [rad or m]."""
 _ON_THE_WAY = 20
@@ -201,7 +202,7 @@ class ClosedLoops:
         active = model.eq_active0.astype(bool)
         linear = np.isin(model.eq_type, [mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtEq.mjEQ_TENDON])
         spatial = bool(np.isin(model.wrap_type, [mujoco.mjtWrap.mjWRAP_JOINT], invert=True).any())
-        single = np.isin(model.jnt_type[model.dof_jntid[self.passive]], _SINGLE).all()
+        single = np.isin(model.jnt_type[model.dof_jntid[self.passive]], SINGLE).all()
         return bool(
             single
             and (linear | ~active).all()

@@ -1,8 +1,8 @@
 """Python pages with values in them: what is foreign, such as a joint's name, becomes a literal and nothing else.
 
 A page is a template, which is Python itself, with names such as ``_JOINTS_`` where values go. Text is written through
-``repr``. Then the page is parsed and compared with its template: where the template has a value's name it may hold a
-literal, and everything else must be the template's own.
+``repr``. Then the page is parsed and compared with its parsed template, whose names are replaced by the values one by
+one: everything else must be the template's own.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import ast
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -58,9 +58,19 @@ def python_page(template: str, values: Mapping[str, Any]) -> str:
         return "\n".join(_lines(value, len(line) - len(line.lstrip(" ")), len(line)))
 
     page = _HOLE.sub(filled, template)
-    own = {word for value in values.values() for word in _words(value)}
-    _compare(ast.parse(template), ast.parse(page), set(values), own)
+    if ast.dump(ast.parse(page)) != ast.dump(_Filled(values).visit(ast.parse(template))):
+        raise RuntimeError("A page holds more than its template and its values.")
     return page
+
+
+class _Filled(ast.NodeTransformer):
+    """Puts values into a parsed template, each by itself."""
+
+    def __init__(self, values: Mapping[str, Any]):
+        self._values = values
+
+    def visit_Name(self, node: ast.Name) -> ast.AST:
+        return ast.parse(_flat(self._values[node.id]), mode="eval").body if node.id in self._values else node
 
 
 def _docstring(text: str) -> str:
@@ -112,55 +122,3 @@ def _dotted(text: str) -> str:
     if not all(part.isidentifier() for part in text.split(".")):
         raise RuntimeError(f"{text!r} is no name.")
     return text
-
-
-def _words(value: Any) -> Iterator[str]:
-    """The parts of a value that are expressions or names of calls, not literals."""
-    if isinstance(value, Word):
-        yield value.text
-    elif isinstance(value, Call):
-        yield value.name
-        yield from (word for item in value.values.values() for word in _words(item))
-    elif isinstance(value, Mapping):
-        yield from (word for item in value.values() for word in _words(item))
-    elif isinstance(value, Sequence) and not isinstance(value, str):
-        yield from (word for item in value for word in _words(item))
-
-
-def _compare(template: Any, page: Any, holes: set[str], own: set[str]) -> None:
-    if isinstance(template, ast.Name) and template.id in holes:
-        if not _is_literal(page, own):
-            raise RuntimeError(f"{ast.unparse(page)[:80]!r} stands where a value of a page belongs.")
-    elif type(template) is not type(page):
-        raise RuntimeError("A page holds more than its template and its values.")
-    elif isinstance(template, ast.AST):
-        for name in template._fields:
-            _compare(getattr(template, name, None), getattr(page, name, None), holes, own)
-    elif isinstance(template, list):
-        if len(template) != len(page):
-            raise RuntimeError("A page holds more than its template and its values.")
-        for one, other in zip(template, page, strict=True):
-            _compare(one, other, holes, own)
-    elif template != page:
-        raise RuntimeError("A page is not its template with values.")
-
-
-def _is_literal(node: ast.AST, own: set[str]) -> bool:
-    match node:
-        case ast.Constant():
-            return True
-        case ast.UnaryOp(op=ast.USub(), operand=ast.Constant()):
-            return True
-        case ast.List(elts=items) | ast.Tuple(elts=items):
-            return all(_is_literal(item, own) for item in items)
-        case ast.Dict(keys=keys, values=items):
-            return all(key is not None and _is_literal(key, own) for key in keys) and all(
-                _is_literal(i, own) for i in items
-            )
-        case ast.Call(func=ast.Name(id="float"), args=[ast.Constant()], keywords=[]):
-            return True
-        case ast.Call(func=name, args=[], keywords=words):
-            return ast.unparse(name) in own and all(w.arg is not None and _is_literal(w.value, own) for w in words)
-        case ast.Name() | ast.Attribute():
-            return ast.unparse(node) in own
-    return False

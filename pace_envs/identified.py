@@ -9,8 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import mujoco
-
 from pace_actuators import IdentifiedDrives, PaceDCMotorCfg, match_names, resolve_joint_values
 from pace_actuators.drive_result import CURE
 from pace_actuators.effects import effect_cfgs
@@ -21,6 +19,7 @@ from pace_envs import mdp
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.manager_based_env import ManagerBasedEnvCfg
 from pace_envs.managers import EventTermCfg
+from pace_envs.motor_coordinates import SINGLE
 from pace_envs.registration import set_physics_dt
 from pace_envs.robot_spec import load_robot_spec
 from pace_envs.task_source import EnvironmentRecord
@@ -33,7 +32,6 @@ _SAME = 0.01
 """Relative difference of gains and limits that does not count."""
 _MOST = 4
 """Labels that a sentence names, at most."""
-_DRIVEN = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
 def use_identified(
@@ -76,7 +74,7 @@ def use_identified(
     cfg.scene.robot.links = {**cfg.scene.robot.links, **drives.links}
     if cfg.sim.device == "cpu" and any(drive.second_order for drive in groups.values()):
         cfg.sim.integrator = "leapfrog"
-        at = min([drives.at.control_dt, *drives.drive.get("drive_dt", {}).values()])
+        at = _loop_dt(drives)
         if abs(cfg.sim.dt - at) < 1e-9 and drives.at.physics_dt < at * (1 - 1e-6) and not own_step:
             set_physics_dt(cfg, drives.at.physics_dt)
     if randomize_std is not None:
@@ -157,7 +155,7 @@ def set_identified_step(cfg: ManagerBasedEnvCfg, identified: IdentifiedDrives | 
         What was changed, in words.
     """
     drives, before = IdentifiedDrives.of(identified), cfg.sim.dt
-    dt = min([drives.at.control_dt, *drives.drive.get("drive_dt", {}).values()])
+    dt = _loop_dt(drives)
     whole = cfg.sim.dt * cfg.decimation / dt
     if dt >= before * (1 - 1e-6) or abs(whole - round(whole)) > 1e-6:
         return None
@@ -176,12 +174,17 @@ def step_note(cfg: ManagerBasedEnvCfg, drives: IdentifiedDrives, before: float) 
     step, control = cfg.sim.dt, drives.at.control_dt
     if step >= before * (1 - 1e-6):
         return ""
-    loop = max(step, min([control, *drives.drive.get("drive_dt", {}).values()]))
+    loop = max(step, _loop_dt(drives))
     note = f"drives {1e3 * loop:g} ms, physics {1e3 * step:g} ms, as in the fit (task: {1e3 * before:g} ms)"
     if step >= control * (1 - 1e-6):
         return note
     cure = f"fit again with --physics_dt {control:g} --drive_dt {control:g}"
     return f"{note}. Fine steps are slow: to train faster, {cure} (docs/training.md)"
+
+
+def _loop_dt(drives: IdentifiedDrives) -> float:
+    """Period of the fastest drive's loop in the identification [s]."""
+    return min([drives.at.control_dt, *drives.drive.get("drive_dt", {}).values()])
 
 
 def _other_drives(robot: ArticulationCfg, drives: IdentifiedDrives) -> list[str]:
@@ -266,7 +269,7 @@ def _with_recorded_gains(robot: ArticulationCfg, drives: IdentifiedDrives) -> Ar
 
 def _groups(robot: ArticulationCfg) -> Iterator[tuple[str, PaceDCMotorCfg, list[str]]]:
     """Each group of drives with its name and its joints, in its order."""
-    names = robot.joint_order or [j.name for j in load_robot_spec(robot).joints if j.type in _DRIVEN]
+    names = robot.joint_order or [j.name for j in load_robot_spec(robot).joints if j.type in SINGLE]
     for group, drive in robot.actuators.items():
         yield group, drive, [names[i] for found in match_names(drive.joint_names_expr, names) for i in found]
 

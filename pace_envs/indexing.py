@@ -26,6 +26,11 @@ def pick(tensor: torch.Tensor | None, ids: Any) -> Any:
     return tensor if tensor is None or isinstance(ids, slice) else tensor[:, ids]
 
 
+def mask_of(env_ids: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+    """Environments by index as a mask, (num_envs,) bool, where a tensor (num_envs,) is."""
+    return torch.zeros_like(like, dtype=torch.bool).index_fill_(0, env_ids, True)
+
+
 def zeros_like(tensor: torch.Tensor) -> torch.Tensor:
     """Zeros that can be written in inference mode and outside of it."""
     with torch.inference_mode(False):

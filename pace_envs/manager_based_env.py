@@ -238,10 +238,10 @@ class ManagerBasedEnv(gym.Env):
 
     def _moving_parts(self) -> list[object]:
         """The objects that keep something from physics step to physics step beside the simulation."""
-        robots = self.scene.articulations.values()
-        drives = [drive for robot in robots for drive in robot.actuators.values()]
-        parts = [part for drive in drives for part in drive.parts().values() if not isinstance(part, DriveState)]
-        return [*parts, *(robot.data for robot in robots), self.action_manager, *self.action_manager.terms]
+        robot = self.scene.robot
+        every = [part for drive in robot.actuators.values() for part in drive.parts().values()]
+        parts = [part for part in every if not isinstance(part, DriveState)]
+        return [*parts, robot.data, self.action_manager, *self.action_manager.terms]
 
     def _graph_key(self) -> Hashable:
         """All that steps read of Python beside what is on the parts."""

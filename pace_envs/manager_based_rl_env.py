@@ -77,7 +77,6 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
     @property
     def takes_masks(self) -> bool:
         """Whether all terms can be reset by a mask instead of indices: those of this package can."""
-        loops = any(robot.closed_loops is not None for robot in self.scene.articulations.values())
         managers = (
             self.action_manager,
             self.command_manager,
@@ -87,7 +86,7 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
             self.reward_manager,
             self.termination_manager,
         )
-        return not loops and all(manager.takes_masks for manager in managers)
+        return self.scene.robot.closed_loops is None and all(manager.takes_masks for manager in managers)
 
     @property
     def can_be_captured(self) -> bool:
@@ -119,29 +118,7 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
         """
         self._check_action(action)
         self.extras = {}
-        if self.masks_resets:
-            return self._step_where(action)
-        self.simulate(action)
-        self.scene.update_sensors(self.step_dt)
-        self.episode_length_buf += 1
-        done = self.termination_manager.compute()
-        reward = self.reward_manager.compute(self.step_dt)
-        terminated, truncated = self.termination_manager.terminated, self.termination_manager.time_outs
-        env_ids = done.nonzero()[:, 0]
-        if len(env_ids):
-            self._keep_final_observations(done)
-            self._reset_idx(env_ids)
-            self.sim.forward(env_ids)
-            self.scene.update()
-        self.command_manager.compute(self.step_dt)
-        self.event_manager.apply("interval", dt=self.step_dt)
-        return self.observation_manager.compute(), reward, terminated, truncated, self.extras
-
-    def _step_where(
-        self, action: torch.Tensor
-    ) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """A step without waiting for the GPU; from a CUDA graph where all terms allow it."""
-        if self.can_be_captured:
+        if self.masks_resets and self.can_be_captured:
             self.action_manager.take_action(action)
             results = self._replayed(
                 "step", lambda: self._advance() | self._after_physics(), lambda: Homes(self._step_parts(), self)
@@ -150,22 +127,29 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
         else:
             self.simulate(action)
             results = self._after_physics()
-        if self._log_names:
+        if self.masks_resets and self._log_names:
             self.extras["log"] = dict(zip(self._log_names, results["log"], strict=True))
-        if self.final_observations:
-            final = {name: results[f"final_obs/{name}"] for name in self.observation_manager.group_obs_dim}
+        groups = self.observation_manager.group_obs_dim
+        if final := {name: results[f"final_obs/{name}"] for name in groups if f"final_obs/{name}" in results}:
             self.extras |= {"final_obs": final, "_final_obs": results["done"]}
-        obs = {name: results[f"obs/{name}"] for name in self.observation_manager.group_obs_dim}
+        obs = {name: results[f"obs/{name}"] for name in groups}
         return obs, results["reward"], results["terminated"], results["time_outs"], self.extras
 
     def _after_physics(self) -> dict[str, torch.Tensor]:
-        """Steps (2) to (7), with a mask of the environments that are done."""
+        """Steps (2) to (7); nothing of it waits for the GPU where :attr:`masks_resets`."""
         self.scene.update_sensors(self.step_dt)
         self.episode_length_buf += 1
         done = self.termination_manager.compute()
         reward = self.reward_manager.compute(self.step_dt)
-        final = self.observation_manager.compute() if self.final_observations else {}
-        self._reset_where(done)
+        ended = None if self.masks_resets else done.nonzero()[:, 0]
+        resets = ended is None or len(ended) > 0
+        final = self.observation_manager.compute() if self.final_observations and resets else {}
+        if ended is None:
+            self._reset_where(done)
+        elif resets:
+            self._reset_idx(ended)
+            self.sim.forward(ended)
+            self.scene.update()
         self.command_manager.compute(self.step_dt)
         self.event_manager.apply("interval", dt=self.step_dt)
         return {
@@ -198,10 +182,6 @@ class ManagerBasedRLEnv(ManagerBasedEnv):
     def _graph_key(self) -> Hashable:
         constants = self.reward_manager.constants, self.observation_manager.constants
         return super()._graph_key(), *constants, self.final_observations
-
-    def _keep_final_observations(self, done: torch.Tensor) -> None:
-        if self.final_observations:
-            self.extras |= {"final_obs": self.observation_manager.compute(), "_final_obs": done.clone()}
 
     def _reset_where(self, done: torch.Tensor) -> None:
         """:meth:`_reset_idx` of environments that are not counted, (num_envs,) bool.

@@ -31,6 +31,8 @@ Rows = Mapping[str, Mapping[str, float]]
 
 CARRIED_FIELDS = tuple(str(BASE_PARAMETERS[name].mujoco) for name in CARRIED)
 """What joints and tendons carry of a drive, by MuJoCo's names."""
+SINGLE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+"""Types of joints that drives move: those of one degree of freedom."""
 _SINGULAR = 1e-9
 """Of the largest singular value of a group's matrix: below, its motors do not determine its joints."""
 
@@ -53,7 +55,7 @@ class DrivenJoints:
         Args:
             names: Joints, and motors by the names of their tendons.
         """
-        single = [model.joint(j).name for j in range(model.njnt) if int(model.jnt_type[j]) in _SINGLE]
+        single = [model.joint(j).name for j in single_joints(model)]
         rows = {name: fixed_tendon(model, name) for name in names if name not in single}
         if unknown := [name for name, row in rows.items() if row is None]:
             raise ValueError(
@@ -155,7 +157,9 @@ class DrivenJoints:
         return np.stack([ends.min(axis=2).sum(axis=1), ends.max(axis=2).sum(axis=1)], axis=1)
 
 
-_SINGLE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+def single_joints(model: mujoco.MjModel) -> list[int]:
+    """A model's hinges and slides, by index."""
+    return [j for j in range(model.njnt) if int(model.jnt_type[j]) in SINGLE]
 
 
 def joint_ranges(model: mujoco.MjModel, joints: Sequence[str]) -> np.ndarray:

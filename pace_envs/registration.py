@@ -1,4 +1,4 @@
-"""Registering environments with Gymnasium and building them."""
+"""Registering environments with Gymnasium and building them: torch and MuJoCo are loaded when one is built."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import difflib
 import sys
 from collections.abc import Callable
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 
-from pace_envs.gym_vector import PaceVectorEnv
-from pace_envs.manager_based_env import ManagerBasedEnvCfg
-from pace_envs.manager_based_rl_env import ManagerBasedRLEnv, ManagerBasedRLEnvCfg
-from pace_envs.model_file import is_model_file
-from pace_envs.motor_coordinates import Rows
+if TYPE_CHECKING:
+    from pace_envs.gym_vector import PaceVectorEnv
+    from pace_envs.manager_based_env import ManagerBasedEnvCfg
+    from pace_envs.manager_based_rl_env import ManagerBasedRLEnv, ManagerBasedRLEnvCfg
+    from pace_envs.motor_coordinates import Rows
 
 _TASKS = {
     "Pace-AnymalD-v0": "pace_envs.tasks.pace.anymal_d:anymal_d_pace_env_cfg",
@@ -86,6 +86,8 @@ def load_env_cfg(task: str, control_dt: float | None = None, motors: Rows | None
     Raises:
         ValueError: If there is no such environment, or it states its control step itself.
     """
+    from pace_envs.model_file import is_model_file
+
     if is_model_file(task):
         from pace_envs.from_model import cfg_from_model  # its configuration is one of this package
 
@@ -132,6 +134,8 @@ def make_env(
         render_mode: ``None`` or ``"rgb_array"``.
         device: ``"cpu"`` or a GPU, ``"cuda:0"``.
     """
+    from pace_envs.manager_based_rl_env import ManagerBasedRLEnv
+
     env_cfg = copy.deepcopy(cfg) if cfg is not None else _load(env_cfg_entry_point)
     if num_envs is not None:
         env_cfg.scene.num_envs = num_envs
@@ -149,6 +153,8 @@ def make_env(
 
 def make_vector_env(num_envs: int = 1, **kwargs: Any) -> PaceVectorEnv:
     """Build Gymnasium's vector form of an environment; ``gym.make_vec`` calls this."""
+    from pace_envs.gym_vector import PaceVectorEnv
+
     return PaceVectorEnv(make_env(num_envs=num_envs, **kwargs))
 
 
@@ -181,6 +187,8 @@ def set_physics_dt(cfg: ManagerBasedEnvCfg, physics_dt: float, name: str = "phys
 
 
 def _load(entry_point: str | Callable[[], Any]) -> Any:
+    from pace_envs.manager_based_env import ManagerBasedEnvCfg
+
     if isinstance(entry_point, str):
         module, _, name = entry_point.partition(":")
         entry_point = getattr(import_module(module), name)

@@ -16,7 +16,7 @@ from pace_actuators import match_names
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.link_inertia import write_links
 from pace_envs.model_file import compile_model, read_model_file
-from pace_envs.motor_coordinates import DrivenJoints, add_motors, fixed_tendon
+from pace_envs.motor_coordinates import DrivenJoints, add_motors, fixed_tendon, single_joints
 
 _REMEMBERED, _LARGEST = 8, 2**20
 """Robots that are kept, the last ones, and bytes of their files at most: a fit builds the same robot many times."""
@@ -180,8 +180,7 @@ def _hold_on(spec: mujoco.MjSpec, model: mujoco.MjModel, body: int, positions: M
 
 def _with_followers(model: mujoco.MjModel, positions: Mapping[str, float]) -> dict[str, float]:
     """The same, with joints that follow held ones."""
-    single = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-    names = [model.joint(j).name for j in range(model.njnt) if int(model.jnt_type[j]) in single]
+    names = [model.joint(j).name for j in single_joints(model)]
     if unknown := [name for name in positions if name not in names]:
         raise ValueError(
             f"{', '.join(unknown)}: no hinge or slide joint of the model, so nothing to hold. Joints: "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from pace_actuators.text import listed
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.closed_loops import ClosedLoops
 from pace_envs.indexing import EnvIds, JointIds, assign, checked_values, find_names, indices, zeros_like
-from pace_envs.motor_coordinates import DrivenJoints, MotorCoordinates, fixed_tendon, joint_ranges
+from pace_envs.motor_coordinates import SINGLE, DrivenJoints, MotorCoordinates, fixed_tendon, joint_ranges
 from pace_envs.quaternions import down, multiply, rotate_inverse
 from pace_envs.simulation import Simulation
 
@@ -91,9 +91,9 @@ class JointLayout:
     """First columns of a floating base in ``qpos`` and ``qvel``; ``None`` for a fixed one."""
     driven: DrivenJoints
     """The joints that they are, or that motors among them move."""
-    passive_names: tuple[str, ...] = ()
+    passive_names: tuple[str, ...]
     """Hinge and slide joints of the model that are not among them: they move as their loads and loops do."""
-    passive_columns: torch.Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.long))
+    passive_columns: torch.Tensor
     """Column of each passive joint in ``qpos``."""
 
     @classmethod
@@ -114,7 +114,7 @@ class JointLayout:
             name, kind = model.joint(j).name, mujoco.mjtJoint(int(model.jnt_type[j]))
             if kind == mujoco.mjtJoint.mjJNT_FREE:
                 root = (int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j]))
-            elif kind in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+            elif kind in SINGLE:
                 single[name] = j
             elif joint_order is None or name in joint_order:
                 raise ValueError(f"The joint {name!r} is a ball joint. Only hinge and slide joints have drives.")

@@ -9,7 +9,6 @@ import mujoco
 import torch
 
 from pace_actuators.config import Config
-from pace_actuators.text import listed
 from pace_envs.articulation import Articulation
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.contact_sensor import ContactSensor, ContactSensorCfg, add_contact_sensor
@@ -63,7 +62,7 @@ class InteractiveSceneCfg(Config):
 
 
 class InteractiveScene:
-    """The entities of all environments, by name: ``scene["robot"]``, and sensors: ``scene.sensors["feet"]``."""
+    """The robot of all environments, ``scene["robot"]``, and sensors by name: ``scene.sensors["feet"]``."""
 
     def __init__(self, cfg: InteractiveSceneCfg, sim_cfg: SimulationCfg):
         """Build the model, start its simulations and find the robot in them."""
@@ -75,7 +74,7 @@ class InteractiveScene:
         for name, sensor in cfg.contact_sensors.items():
             add_contact_sensor(spec, name, sensor)
         self.sim = make_simulation(sim_cfg, spec, cfg.num_envs)
-        self.articulations = {"robot": Articulation(cfg.robot, self.sim)}
+        self.robot = Articulation(cfg.robot, self.sim)
         self.sensors = {name: ContactSensor(c, name, self.sim) for name, c in cfg.contact_sensors.items()}
 
     @property
@@ -85,15 +84,14 @@ class InteractiveScene:
 
     def __getitem__(self, name: str) -> Articulation:
         """The entity of that name."""
-        if name not in self.articulations:
-            raise KeyError(f"The scene has no {name!r}. Available: {listed(self.articulations)}.")
-        return self.articulations[name]
+        if name != "robot":
+            raise KeyError(f"The scene has no {name!r}. Available: robot.")
+        return self.robot
 
     def reset(self, env_ids: EnvIds = None) -> None:
         """Put all or some environments back to their initial state."""
         self.sim.reset(env_ids)
-        for articulation in self.articulations.values():
-            articulation.reset(env_ids)
+        self.robot.reset(env_ids)
         rows = self.sim.rows(env_ids)
         for sensor in self.sensors.values():
             sensor.reset(rows)
@@ -104,7 +102,7 @@ class InteractiveScene:
 
         The others get back their state and targets. So a few can be reset without being counted.
         """
-        parts = [*self.sim.state, *(each for robot in self.articulations.values() for each in robot.targets)]
+        parts = [*self.sim.state, *self.robot.targets]
         before = [part.clone() for part in parts]
         yield
         for part, old in zip(parts, before, strict=True):
@@ -117,25 +115,21 @@ class InteractiveScene:
         The drives are left to :meth:`reset_drives_where`.
         """
         self.sim.reset(slice(None))
-        for articulation in self.articulations.values():
-            articulation.reset_state(slice(None))
+        self.robot.reset_state(slice(None))
         for sensor in self.sensors.values():
             sensor.reset(mask)
 
     def reset_drives_where(self, mask: torch.Tensor) -> None:
         """Let the drives of environments forget that are not counted, (num_envs,) bool."""
-        for articulation in self.articulations.values():
-            articulation.reset_drives(mask)
+        self.robot.reset_drives(mask)
 
     def write_data_to_sim(self) -> None:
         """Run the drives and apply their torques."""
-        for articulation in self.articulations.values():
-            articulation.write_data_to_sim()
+        self.robot.write_data_to_sim()
 
     def update(self) -> None:
         """Read the state after a physics step."""
-        for articulation in self.articulations.values():
-            articulation.update()
+        self.robot.update()
 
     def update_sensors(self, dt: float) -> None:
         """Read the contacts after an environment step of ``dt`` seconds."""

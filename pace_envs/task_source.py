@@ -11,11 +11,10 @@ from typing import Any
 
 from pace_actuators.files import checked
 from pace_actuators.own_code import (
-    absolute_reference,
     checked_record,
     code_of,
-    import_named,
     import_recorded,
+    import_reference,
     loaded_module,
     split_reference,
     trust,
@@ -35,14 +34,7 @@ def use_task(text: str) -> str:
         if not Path(text).is_file():
             raise ValueError(f"--task {text}: there is no such model file. Correct its path.")
         return str(Path(text).resolve())
-    module, _ = split_reference(text)
-    if not module:
-        return text
-    try:
-        import_named(module)
-    except ValueError as error:
-        raise ValueError(f"--task {text}: {error}") from None
-    return absolute_reference(text)
+    return import_reference(text, f"--task {text}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -43,7 +43,6 @@ class CommandRateLimit(Effect):
     probes = ({"velocity": 8.0}, {"velocity": 4.0}, {"velocity": 2.0}, {"velocity": 1.0}, {"velocity": 0.5})
     two_sided = False
     separates = "a larger and faster motion"
-    velocity: torch.Tensor
 
     def prepare(self) -> None:
         """Largest move per control step."""
@@ -93,7 +92,6 @@ class CommandAccelerationLimit(Effect):
     separates = "a larger and faster motion"
     profile_dt: ClassVar[float] = 0.00125
     """Longest step of the profile [s]."""
-    acceleration: torch.Tensor
 
     def prepare(self) -> None:
         """Steps of the profile in a control step, and what one adds to the speed."""
@@ -132,7 +130,6 @@ class CommandFilter(Effect):
     probes = ({"time_constant": 0.003}, {"time_constant": 0.01}, {"time_constant": 0.04})
     two_sided = False
     separates = "steps, whose rounding a pure delay does not have"
-    time_constant: torch.Tensor
 
     def prepare(self) -> None:
         """Weight of a command in the target, one control step after it."""
@@ -175,7 +172,6 @@ class OtherDelay(Effect):
     two_sided = False
     twins = ("measurement_delay",)
     separates = "recordings at another proportional gain"
-    delay: torch.Tensor
 
     def prepare(self) -> None:
         """Lags in the steps of the path: torques pass at every physics step, targets at every run of the controller."""
@@ -211,7 +207,6 @@ class ProportionalGain(Effect):
     probes = ({"gain": 1.02}, {"gain": 0.4}, {"gain": 2.5})
     scales = "proportional gain"
     separates = "recordings at another gain, and a known added mass"
-    gain: torch.Tensor
 
     def controller(self, s: DriveState) -> None:
         """Scale kp."""
@@ -232,7 +227,6 @@ class DerivativeGain(Effect):
     probes = ({"gain": 1.05}, {"gain": 0.3}, {"gain": 3.0})
     scales = "derivative gain"
     separates = "recordings at another derivative gain"
-    gain: torch.Tensor
 
     def controller(self, s: DriveState) -> None:
         """Scale kd."""
@@ -258,7 +252,6 @@ class GravityCompensation(Effect):
     probes = ({"share": 0.1},)
     reads_load = True
     separates = "a motion fast enough to separate weight from inertia, and a recording without the feed-forward"
-    share: torch.Tensor
 
     def effort_command(self, s: DriveState) -> None:
         """Add what holds that part of the load."""
@@ -291,7 +284,6 @@ class FastLoop(Effect):
     probes = ({"share": 0.5}, {"share": 1.0})
     two_sided = False
     separates = "recordings at another proportional gain"
-    share: torch.Tensor
 
     def controller(self, s: DriveState) -> None:
         """Remember what it sees."""
@@ -339,8 +331,6 @@ class IntegralGain(Effect):
     probes = ({"effort": 100.0}, {"effort": 5.0}, {"effort": 1.0})
     two_sided = False
     separates = "a staircase that holds each of its steps longer"
-    gain: torch.Tensor
-    effort: torch.Tensor
 
     def prepare(self) -> None:
         """What an error adds in a control step."""

@@ -10,7 +10,7 @@ import torch
 
 from pace_actuators.effects.drive_state import DriveState
 from pace_actuators.effects.effect import Conditions, Effect, EffectParameter
-from pace_actuators.effects.free_form import SHARE, FreeForm, parameters_of_curve
+from pace_actuators.effects.free_form import SHARE, FreeForm, GainCurve, parameters_of_curve
 from pace_actuators.effects.registry import register_effect
 
 _PLACES = 9
@@ -53,17 +53,6 @@ class _OfCondition(Effect):
         return torch.where(self._rate > 0, result, self.usual())
 
 
-def _scale_friction(s: DriveState, change: torch.Tensor) -> None:
-    """Add a part of itself to both frictions."""
-    s.friction += change * s.base_friction
-    s.viscous_friction += change * s.base_viscous_friction
-
-
-def _scale_torque(s: DriveState, gain: torch.Tensor) -> None:
-    s.effort *= gain
-    s.speed_slope *= gain
-
-
 @register_effect
 class ThermalFriction(_OfCondition):
     """All friction falls as the drive warms up: 1 + k (T - 25 °C) times Coulomb and viscous friction."""
@@ -79,11 +68,10 @@ class ThermalFriction(_OfCondition):
     looks = "the hysteresis loop becomes narrower as the drive warms up"
     source = "Bittencourt, Gunnarsson 2012, static friction in a robot joint: load and temperature"
     separates = "the same motion again, cold and warm"
-    slope: torch.Tensor
 
     def friction(self, s: DriveState) -> None:
         """Scale both frictions."""
-        _scale_friction(s, (self.slope * (self.now(s) - _REFERENCE)).clamp(min=_LEAST - 1.0))
+        s.add_friction((self.slope * (self.now(s) - _REFERENCE)).clamp(min=_LEAST - 1.0))
 
 
 @register_effect
@@ -101,11 +89,10 @@ class ThermalTorque(_OfCondition):
     looks = "the joint sags and slows down as the motor warms up"
     source = "magnets lose 0.1 to 0.2 % of their flux per °C"
     separates = "the same motion again, cold and warm"
-    slope: torch.Tensor
 
     def drive(self, s: DriveState) -> None:
         """Scale the torque."""
-        _scale_torque(s, (1.0 + self.slope * (self.now(s) - _REFERENCE)).clamp(min=_LEAST))
+        s.scale_torque((1.0 + self.slope * (self.now(s) - _REFERENCE)).clamp(min=_LEAST))
 
 
 @register_effect
@@ -132,8 +119,6 @@ class SupplyVoltage(_OfCondition):
     source = "a bridge that is switched: its mean voltage is a share of the supply's"
     probes = tuple({"nominal": u} for u in (7.0, 12.0, 24.0, 48.0))
     separates = "the same motion again with another voltage"
-    share: torch.Tensor
-    nominal: torch.Tensor
 
     def usual(self) -> torch.Tensor:
         """The nominal voltage."""
@@ -141,14 +126,13 @@ class SupplyVoltage(_OfCondition):
 
     def drive(self, s: DriveState) -> None:
         """Scale the torque."""
-        _scale_torque(s, (1.0 + self.share * (self.now(s) / self.nominal - 1.0)).clamp(min=_LEAST))
+        s.scale_torque((1.0 + self.share * (self.now(s) / self.nominal - 1.0)).clamp(min=_LEAST))
 
 
 class _Curve(_OfCondition, FreeForm):
     """A curve over a condition."""
 
     knots = _FEW
-    center: torch.Tensor
 
     def usual(self) -> torch.Tensor:
         """That of the knot 0."""
@@ -171,22 +155,19 @@ class FrictionOverTemperature(_Curve):
 
     def friction(self, s: DriveState) -> None:
         """Scale both frictions."""
-        _scale_friction(s, self.at(self.now(s)))
+        s.add_friction(self.at(self.now(s)))
 
 
-class _GainCurve(_Curve):
-    """The drive gives (1 + f(x)) times the torque that is asked."""
+class _GainOverCondition(_Curve, GainCurve):
+    """A gain over a condition."""
 
-    stage = "drive"
-    kind = "gain"
-
-    def drive(self, s: DriveState) -> None:
-        """Scale the torque."""
-        _scale_torque(s, 1.0 + self.at(self.now(s)))
+    def over(self, s: DriveState) -> torch.Tensor:
+        """The condition."""
+        return self.now(s)
 
 
 @register_effect
-class GainOverTemperature(_GainCurve):
+class GainOverTemperature(_GainOverCondition):
     """The drive's torque is (1 + f(T)) times what is asked, T the motor's temperature."""
 
     name = "gain_over_temperature"
@@ -198,7 +179,7 @@ class GainOverTemperature(_GainCurve):
 
 
 @register_effect
-class GainOverVoltage(_GainCurve):
+class GainOverVoltage(_GainOverCondition):
     """The drive's torque is (1 + f(U)) times what is asked, U the supply's voltage."""
 
     name = "gain_over_voltage"

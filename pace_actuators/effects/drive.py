@@ -28,12 +28,10 @@ class TorqueGain(Effect):
     twins = ("payload",)
     scales = "torque"
     separates = "a recording with a known added mass"
-    gain: torch.Tensor
 
     def drive(self, s: DriveState) -> None:
         """Scale the torque."""
-        s.effort *= self.gain
-        s.speed_slope *= self.gain
+        s.scale_torque(self.gain)
 
 
 @register_effect
@@ -70,8 +68,6 @@ class TorqueFade(Effect):
     separates = "the same motion again after much work, and after a pause"
     least: ClassVar[float] = 0.1
     """What is left of the torque in any case."""
-    effort: torch.Tensor
-    time_constant: torch.Tensor
 
     def prepare(self) -> None:
         """What the heat takes, and how fast it follows."""
@@ -87,8 +83,7 @@ class TorqueFade(Effect):
         self.begin(_heat=self._first)
         asked = s.effort.clone()
         left = (1.0 - self._heat * self._per_heat).clamp(min=self.least)
-        s.effort *= left
-        s.speed_slope *= left
+        s.scale_torque(left)
         self._heat = torch.lerp(self._heat, asked.square(), self._weight)
 
 
@@ -120,7 +115,6 @@ class SupplySag(Effect):
     probes = tuple({"effort": e} for e in (2000.0, 600.0, 200.0, 60.0, 20.0, 6.0, 2.0))
     two_sided = False
     separates = "another load; the supply's voltage in the log"
-    effort: torch.Tensor
 
     def drive(self, s: DriveState) -> None:
         """Give what is left."""
@@ -145,7 +139,6 @@ class DriveBandwidth(Effect):
     probes = ({"time_constant": 0.001}, {"time_constant": 0.005}, {"time_constant": 0.015})
     two_sided = False
     separates = "a known added mass, and recordings at another gain"
-    time_constant: torch.Tensor
 
     def prepare(self) -> None:
         """Weights of the command in the torque at the end of a step and in its mean over the step."""
@@ -183,9 +176,6 @@ class TorqueRipple(Effect):
     probes = tuple({"sine": a, "cosine": b} for a, b in ((0.1, 0.0), (0.0, 0.1)))
     comb = ("periods", "sine", "cosine")
     separates = "a slow motion over a wide range"
-    sine: torch.Tensor
-    cosine: torch.Tensor
-    periods: torch.Tensor
 
     def drive(self, s: DriveState) -> None:
         """Add the ripple."""
@@ -209,7 +199,6 @@ class TorqueLimit(Effect):
     probes = tuple({"effort": e} for e in (60.0, 40.0, 30.0, 20.0, 14.0, 10.0, 7.0, 5.0, 3.0, 1.0, 0.5, 0.3))
     two_sided = False
     separates = "a larger and faster motion"
-    effort: torch.Tensor
 
     def current_limit(self, s: DriveState) -> None:
         """Clip."""
@@ -239,7 +228,6 @@ class OffDamping(Effect):
     probes = ({"damping": 0.1}, {"damping": 1.0})
     acts_while_off = True
     separates = "a recording with the drive switched off while the joint moves"
-    damping: torch.Tensor
 
     def friction(self, s: DriveState) -> None:
         """Add it while the drive is off."""
@@ -284,8 +272,6 @@ class TorqueSpeedLimit(Effect):
     )
     two_sided = False
     separates = "a larger and faster motion"
-    velocity: torch.Tensor
-    effort: torch.Tensor
 
     def prepare(self) -> None:
         """Stall torque, finite so that no speed makes it undefined."""

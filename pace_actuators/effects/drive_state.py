@@ -97,6 +97,16 @@ class DriveState(Part):
         left_out = (() if with_load else ("load_effort",)) + (() if with_link else _LINK_FIELDS)
         return DriveState({name: getattr(self, name)[rows] for name in _FIELDS if name not in left_out})
 
+    def scale_torque(self, gain: torch.Tensor) -> None:
+        """Multiply the torque, and how fast it falls with the speed."""
+        self.effort *= gain
+        self.speed_slope *= gain
+
+    def add_friction(self, change: torch.Tensor) -> None:
+        """Add a part of itself to both base frictions."""
+        self.friction += change * self.base_friction
+        self.viscous_friction += change * self.base_viscous_friction
+
     def __getattr__(self, name: str) -> torch.Tensor:
         """Only reached by names that are no field.
 

@@ -250,6 +250,11 @@ class Effect(Part):
             setattr(self, name, self.full(self.memory[name] if isinstance(self.memory, Mapping) else 0.0))
         self.prepare()
 
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> torch.Tensor:
+            """Parameters are attributes, (rows, num_joints) each: a class need not declare them again."""
+
     # ---- what a subclass overrides -------------------------------------------------------------------------------
 
     def prepare(self) -> None:
@@ -369,10 +374,8 @@ class Effect(Part):
         """What it keeps from call to call."""
         return (*self.memory, "new_rows")
 
-    def set_parameter(
-        self, name: str, values: torch.Tensor | float, rows: Any = slice(None), joints: Any = None
-    ) -> None:
-        """Set a parameter in some of its rows and joints; call :meth:`prepare` after the last one.
+    def set_parameter(self, name: str, values: torch.Tensor | float, joints: torch.Tensor | None = None) -> None:
+        """Set a parameter on all joints or some, by index; call :meth:`prepare` after the last one.
 
         Raises:
             ValueError: If there is no such parameter.
@@ -383,9 +386,9 @@ class Effect(Part):
         tensor = getattr(self, name)
         values = torch.as_tensor(values, **self._options)
         if joints is None:
-            tensor[rows] = values
+            tensor[:] = values
         else:
-            tensor[rows] = tensor[rows].index_copy(1, joints, values.expand(tensor[rows].shape[0], len(joints)))
+            tensor.index_copy_(1, joints, values.expand(len(tensor), len(joints)))
 
     @classmethod
     def overrides(cls, method: str) -> bool:

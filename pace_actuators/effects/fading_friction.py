@@ -71,7 +71,6 @@ class CreepingFriction(Effect):
     source = "regularised Coulomb friction (e.g. Marques, Flores, Claro, Lankarani 2016); simulators' soft friction"
     probes = ({"velocity": 0.005}, {"velocity": 0.02}, {"velocity": 0.08}, {"velocity": 0.25})
     separates = _SEPARATES
-    velocity: torch.Tensor
 
     def prepare(self) -> None:
         """Where it acts."""
@@ -124,7 +123,6 @@ class SoftFriction(Effect):
     two_sided = False
     smooths_friction = True
     separates = _SEPARATES
-    time_constant: torch.Tensor
 
     def constraint(self, s: DriveState) -> None:
         """Let the simulator apply it."""

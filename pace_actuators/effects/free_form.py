@@ -64,7 +64,6 @@ class FreeForm(Effect):
     kind: ClassVar[Literal["torque", "friction", "gain", "inertia"]] = "torque"
     """What it is: a torque or a friction, which is added, or what a torque or the inertia is multiplied by."""
     source = "piecewise linear; no physics behind it"
-    reach: torch.Tensor
 
     @classmethod
     def curve(cls, values: Mapping[str, float]) -> dict[str, list[float]]:
@@ -121,7 +120,6 @@ class TorqueOverPosition(FreeForm):
     equation = "τ + f(q)"
     looks = "the error goes with the position, up and down strokes alike"
     separates = "a staircase over the whole range"
-    center: torch.Tensor
 
     def transmission(self, s: DriveState) -> None:
         """Add it at the joint."""
@@ -199,7 +197,6 @@ class FrictionOverPosition(FreeForm):
     equation = "F = F_c + f(q), f = 0 at the center"
     looks = "the hysteresis loop is wider at some positions than at others"
     separates = "a slow triangle over the whole range"
-    center: torch.Tensor
 
     def friction(self, s: DriveState) -> None:
         """Change the level."""
@@ -227,7 +224,7 @@ class FrictionOverLoad(FreeForm):
         s.friction += self.at((s.motor_effort - s.load_effort).abs())
 
 
-class _Gain(FreeForm):
+class GainCurve(FreeForm):
     """The drive gives (1 + f(x)) times the torque that is asked."""
 
     stage = "drive"
@@ -239,13 +236,11 @@ class _Gain(FreeForm):
 
     def drive(self, s: DriveState) -> None:
         """Scale the torque."""
-        gain = 1.0 + self.at(self.over(s))
-        s.effort *= gain
-        s.speed_slope *= gain
+        s.scale_torque(1.0 + self.at(self.over(s)))
 
 
 @register_effect
-class GainOverTime(_Gain):
+class GainOverTime(GainCurve):
     """The drive's torque is (1 + f(t)) times what is asked."""
 
     name = "gain_over_time"
@@ -262,7 +257,7 @@ class GainOverTime(_Gain):
 
 
 @register_effect
-class GainOverPosition(_Gain):
+class GainOverPosition(GainCurve):
     """The drive's torque is (1 + f(q)) times what is asked."""
 
     name = "gain_over_position"
@@ -272,7 +267,6 @@ class GainOverPosition(_Gain):
     equation = "τ -> (1 + f(q)) τ"
     looks = "the error goes with the torque, more at some positions than at others"
     separates = "a staircase over the whole range, with two loads"
-    center: torch.Tensor
 
     def over(self, s: DriveState) -> torch.Tensor:
         """Position."""
@@ -280,7 +274,7 @@ class GainOverPosition(_Gain):
 
 
 @register_effect
-class GainOverSpeed(_Gain):
+class GainOverSpeed(GainCurve):
     """The drive's torque is (1 + f(|v|)) times what is asked, f(0) = 0."""
 
     name = "gain_over_speed"
@@ -313,9 +307,7 @@ class FrictionOverTime(FreeForm):
 
     def friction(self, s: DriveState) -> None:
         """Scale both frictions."""
-        change = self.at(s.time)
-        s.friction += change * s.base_friction
-        s.viscous_friction += change * s.base_viscous_friction
+        s.add_friction(self.at(s.time))
 
 
 @register_effect
@@ -336,7 +328,6 @@ class InertiaOverPosition(FreeForm):
     reads_link = True
     changes_armature = True
     separates = "fast motions about several positions"
-    center: torch.Tensor
     across: ClassVar[float] = 0.05
     """Part of the reach over which the slope is taken."""
 

@@ -33,8 +33,6 @@ class StribeckFriction(Effect):
     probes = ({"velocity": 0.03}, {"velocity": 0.1}, {"velocity": 0.3}, {"velocity": 0.8})
     two_sided = False
     separates = "a slow triangle"
-    effort: torch.Tensor
-    velocity: torch.Tensor
 
     def friction(self, s: DriveState) -> None:
         """Raise the level near standstill."""
@@ -60,7 +58,6 @@ class DynamicFriction(Effect):
     two_sided = False
     twins = ("stribeck_friction",)
     separates = "a slow triangle"
-    ratio: torch.Tensor
 
     creep = 0.02
     """v_s [rad/s]."""
@@ -89,7 +86,6 @@ class LoadDependentFriction(Effect):
     reads_load = True
     needs_loads = True
     separates = "recordings at two loads"
-    coefficient: torch.Tensor
 
     def friction(self, s: DriveState) -> None:
         """Raise the level with the load."""
@@ -115,7 +111,6 @@ class FrictionAsymmetry(Effect):
     probes = ({"effort": 0.05},)
     twins = ("torque_offset",)
     separates = "a second session: a torque stays when the friction changes"
-    effort: torch.Tensor
 
     def friction(self, s: DriveState) -> None:
         """Brake one way more than the other."""
@@ -151,7 +146,6 @@ class QuadraticFriction(Effect):
     source = "churning of a gear's oil; BAM (Rhoban)"
     probes = ({"coefficient": 0.02},)
     separates = "a faster motion"
-    coefficient: torch.Tensor
 
     def friction(self, s: DriveState) -> None:
         """Change the viscous friction, which the simulator integrates implicitly."""
@@ -176,14 +170,10 @@ class FrictionDrift(Effect):
     source = "grease that warms up"
     probes = ({"time_constant": 5.0}, {"time_constant": 20.0}, {"time_constant": 80.0})
     separates = "the first recording once more at the end of the session"
-    ratio: torch.Tensor
-    time_constant: torch.Tensor
 
     def friction(self, s: DriveState) -> None:
         """Scale the base friction."""
-        change = -self.ratio * torch.expm1(-s.time / self.time_constant)
-        s.friction += change * s.base_friction
-        s.viscous_friction += change * s.base_viscous_friction
+        s.add_friction(-self.ratio * torch.expm1(-s.time / self.time_constant))
 
 
 @register_effect
@@ -220,7 +210,6 @@ class PreslidingFriction(Effect):
     two_sided = False
     is_stiff = True
     separates = "a slow triangle of small amplitude"
-    stiffness: torch.Tensor
 
     def prepare(self) -> None:
         """Where it acts."""

@@ -22,7 +22,6 @@ class EncoderScale(Effect):
     source = "e.g. a wrong gear ratio or a non-linear potentiometer"
     probes = ({"error": 0.002},)
     separates = "a wide range of motion, and a known added mass"
-    error: torch.Tensor
 
     def measurement(self, s: DriveState) -> None:
         """Scale the position."""
@@ -51,8 +50,6 @@ class EncoderEccentricity(Effect):
     source = "standard for magnetic and optical ring encoders"
     probes = ({"sine": 0.001, "cosine": 0.0}, {"sine": 0.0, "cosine": 0.001})
     separates = "a wide range of motion"
-    sine: torch.Tensor
-    cosine: torch.Tensor
 
     def measurement(self, s: DriveState) -> None:
         """Add the once-per-turn error."""
@@ -79,7 +76,6 @@ class VelocityFilter(Effect):
     probes = ({"time_constant": 0.002}, {"time_constant": 0.01})
     two_sided = False
     separates = "recordings at another derivative gain"
-    time_constant: torch.Tensor
 
     def prepare(self) -> None:
         """Weight of the newest speed."""
@@ -109,7 +105,6 @@ class MeasurementDelay(Effect):
     twins = ("other_delay",)
     absorbed_by = "delay"
     separates = "time stamps taken by the drive itself"
-    delay: torch.Tensor
 
     def observation_lag(self, time: torch.Tensor) -> torch.Tensor:
         """The same at all times."""
@@ -130,7 +125,6 @@ class ClockSkew(Effect):
     source = "two computers without a common clock"
     probes = ({"skew": 1e-4},)
     separates = "a longer recording"
-    skew: torch.Tensor
 
     def observation_lag(self, time: torch.Tensor) -> torch.Tensor:
         """It grows with time."""

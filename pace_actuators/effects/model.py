@@ -41,7 +41,6 @@ class Payload(Effect):
     twins = ("torque_gain",)
     scales = "mass of the link"
     separates = "a recording with a known added mass"
-    ratio: torch.Tensor
 
     def write_model(self, model: LinkModel, joint: int) -> None:
         """Write body_mass and body_inertia."""
@@ -63,7 +62,6 @@ class ComOffset(Effect):
     probes = ({"angle": 0.01},)
     absorbed_by = "encoder_bias"
     separates = "an absolute reference of the position"
-    angle: torch.Tensor
 
     def write_model(self, model: LinkModel, joint: int) -> None:
         """Write body_ipos and body_iquat."""

@@ -91,9 +91,6 @@ class MountCompliance(Effect):
     source = "two-inertia system"
     probes = tuple({"stiffness": k, "inertia": j} for k in (4000.0, 1000.0, 400.0) for j in (0.4, 1.5))
     separates = "higher frequencies, and the mount held by hand"
-    stiffness: torch.Tensor
-    damping: torch.Tensor
-    inertia: torch.Tensor
 
     def prepare(self) -> None:
         """Where it acts."""

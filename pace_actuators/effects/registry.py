@@ -9,9 +9,8 @@ from importlib import import_module
 from pace_actuators.effects.effect import Effect
 from pace_actuators.own_code import (
     CodeRecord,
-    absolute_reference,
-    import_named,
     import_recorded,
+    import_reference,
     is_path,
     loaded_module,
     split_reference,
@@ -64,14 +63,9 @@ def import_effect(text: str) -> str:
             registered name is returned as it is.
     """
     name, at, joints = text.partition("@")
-    module, _ = split_reference(name)
-    if not module:
+    if not split_reference(name)[0]:
         return text
-    try:
-        import_named(module)
-    except ValueError as error:
-        raise ValueError(f"The effect {name!r}: {error}") from None
-    name = absolute_reference(name)
+    name = import_reference(name, f"The effect {name!r}")
     get_effect(name)
     return f"{name}{at}{joints}"
 

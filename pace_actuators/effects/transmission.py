@@ -25,7 +25,6 @@ class TorqueOffset(Effect):
     probes = ({"effort": 0.1},)
     twins = ("friction_asymmetry",)
     separates = "another pose of the robot, and an absolute reference of the position"
-    effort: torch.Tensor
 
     def transmission(self, s: DriveState) -> None:
         """Add it."""
@@ -62,8 +61,6 @@ class ParallelSpring(Effect):
     source = "cables and hoses along a joint; balancing springs"
     probes = ({"rest": 0.0}, {"rest": 1.0}, {"rest": -1.0})
     separates = "a wide range of motion, and a known added mass"
-    stiffness: torch.Tensor
-    rest: torch.Tensor
 
     def transmission(self, s: DriveState) -> None:
         """Pull towards its rest position."""

@@ -26,6 +26,7 @@ Source: Newmark 1959; Spong 1987 for the flexible joint.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import ClassVar
 
 import torch
@@ -46,6 +47,20 @@ added, which ends it."""
 _HARDEST = 1e-4
 """Least R' / A of soft friction, as MuJoCo has it."""
 
+_STIFFNESS = EffectParameter(
+    name="stiffness",
+    unit="N m/rad",
+    lower=80.0,
+    upper=2e4,
+    null=float("inf"),
+    start=1000.0,
+    scale="log",
+    meaning="k",
+    follows_loop=True,
+)
+_DAMPING = EffectParameter(
+    name="damping", unit="N m s/rad", lower=0.0, upper=20.0, null=None, start=0.5, meaning="c", follows_loop=True
+)
 _SIDE = EffectParameter(
     name="encoder_side",
     unit="1",
@@ -78,9 +93,6 @@ class _TwoMass(Effect):
     numerical_damping: ClassVar[float] = 0.05
     """Part of k h below which c does not fall (half of what it says is added there, so that a fit feels it): what is
     too fast for the step dies out, a resonance inside the band does not."""
-    stiffness: torch.Tensor
-    damping: torch.Tensor
-    encoder_side: torch.Tensor
 
     def switched_on(self) -> torch.Tensor:
         """Where motor and link are two, (rows, num_joints) bool."""
@@ -231,38 +243,13 @@ class JointElasticity(_TwoMass):
     """Motor and link are joined by a spring and a damper, k and c."""
 
     name = "joint_elasticity"
-    parameters = (
-        EffectParameter(
-            name="stiffness",
-            unit="N m/rad",
-            lower=80.0,
-            upper=2e4,
-            null=float("inf"),
-            start=1000.0,
-            scale="log",
-            meaning="k",
-            follows_loop=True,
-        ),
-        EffectParameter(
-            name="damping",
-            unit="N m s/rad",
-            lower=0.0,
-            upper=20.0,
-            null=None,
-            start=0.5,
-            meaning="c",
-            follows_loop=True,
-        ),
-        _SIDE,
-    )
+    parameters = (_STIFFNESS, _DAMPING, _SIDE)
     equation = "J d²θ/dt² = τ - f - friction, link: + f, f = k (θ - q) + c (dθ/dt - dq/dt)"
     part = "belt, harmonic drive, long shaft"
     looks = "resonance and anti-resonance; the base fit is overdamped with parameters at their bounds"
     source = "Spong 1987, flexible joint"
     probes = tuple({"stiffness": k, "encoder_side": e} for k in (5000.0, 1500.0, 500.0, 200.0) for e in (0.0, 1.0))
     separates = "higher frequencies, and a known added mass"
-    stiffness: torch.Tensor
-    damping: torch.Tensor
 
     def switched_on(self) -> torch.Tensor:
         """Where the stiffness is finite."""
@@ -290,27 +277,8 @@ class Backlash(_TwoMass):
     name = "backlash"
     parameters = (
         EffectParameter(name="gap", unit="rad", lower=0.0, upper=0.05, null=0.0, start=0.004),
-        EffectParameter(
-            name="stiffness",
-            unit="N m/rad",
-            lower=300.0,
-            upper=2e4,
-            null=None,
-            start=5000.0,
-            scale="log",
-            meaning="k",
-            follows_loop=True,
-        ),
-        EffectParameter(
-            name="damping",
-            unit="N m s/rad",
-            lower=0.0,
-            upper=20.0,
-            null=None,
-            start=5.0,
-            meaning="c",
-            follows_loop=True,
-        ),
+        replace(_STIFFNESS, lower=300.0, null=None, start=5000.0),
+        replace(_DAMPING, start=5.0),
         _SIDE,
     )
     equation = "as joint_elasticity with f = k dz(θ - q, ± gap/2)"
@@ -320,9 +288,6 @@ class Backlash(_TwoMass):
     probes = tuple({"gap": g, "encoder_side": e} for g in (0.002, 0.008, 0.025) for e in (0.0, 1.0))
     separates = "several amplitudes, and a 1.5 times larger proportional gain"
     numerical_damping = 0.3  # a contact shorter than a few steps would push harder on the way out than on the way in
-    gap: torch.Tensor
-    stiffness: torch.Tensor
-    damping: torch.Tensor
 
     def switched_on(self) -> torch.Tensor:
         """Where there is a gap."""

@@ -77,8 +77,8 @@ def robot_source(
     dof: torch.Tensor,
     num_joints: int,
     version: str,
-    coordinates: MotorCoordinates | None = None,
-    carrying: torch.Tensor | None = None,
+    coordinates: MotorCoordinates | None,
+    carrying: torch.Tensor | None,
 ) -> RobotSource:
     """C of all drives of a robot.
 

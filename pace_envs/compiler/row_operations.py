@@ -293,7 +293,7 @@ def _taken(space: RowSpace, args: Sequence[Any], kwargs: dict[str, Any], target:
     if not known:
         return None
     if columns is not None:
-        return _columns_taken(space, args[0], columns, None)
+        return _entries_taken(space, args[0], 1, _for_rows(space, columns), None)
     result = torch.empty(args[0].shape, dtype=args[0].dtype, device=space.device)
     return on_elements(space, "clone", args[:1], {}, result)
 
@@ -303,29 +303,12 @@ def _selected(space: RowSpace, args: Sequence[Any], kwargs: dict[str, Any], targ
     source, dim, index = args
     if not _has_rows_first(space, source) or source.ndim != 2 or dim % 2 != 1 or index.dtype != torch.int64:
         return None
-    return _columns_taken(space, source, index, target)
+    return _entries_taken(space, source, 1, _for_rows(space, index), target)
 
 
-def _columns_taken(space: RowSpace, source: torch.Tensor, columns: torch.Tensor, target: Any) -> Plan:
-    flat = columns.reshape(-1)
-    result = target
-    if result is None:
-        result = torch.empty(space.rows, len(flat), dtype=source.dtype, device=space.device)
-    if not _takes(space, result, source, flat) or not _has_rows_first(space, result) or result.dtype != source.dtype:
-        return None
-    from_, to, at = space.array(source), space.array(result), space.array(flat)
-
-    def emit(writer: Writer) -> None:
-        for i in range(len(flat)):
-            column = _from_zero(writer, writer.load(at, (i,), None), source.shape[1])
-            value = writer.load_at(from_, from_.offset, source.stride(0), column, source.stride(1))
-            writer.store(to, (0, i), -2, value)
-
-    return result, _operation(emit, [(from_, -2), (at, None)], [(to, -2)], is_single=False)
-
-
-def _from_zero(writer: Writer, column: Node, size: int) -> Node:
-    return writer.tape.add(f"({{0}} < 0 ? {{0}} + {size} : {{0}})", column, kind=column.kind)
+def _for_rows(space: RowSpace, columns: torch.Tensor) -> torch.Tensor:
+    """Columns, which all rows share, as an index of each row."""
+    return columns.reshape(1, -1).expand(space.rows, -1)
 
 
 def _put(space: RowSpace, args: Sequence[Any], kwargs: dict[str, Any], target: Any) -> Plan:
@@ -343,20 +326,10 @@ def _put(space: RowSpace, args: Sequence[Any], kwargs: dict[str, Any], target: A
         return None
     if columns is None:
         return on_elements(space, "copy", [field, value], {}, field)
-    flat = columns.reshape(-1)
-    to, from_, at = space.array(field), space.array(value), space.array(flat)
-    spread = _fits(from_, -2, space.rows) and (value.ndim == 0 or value.shape[-1] in (1, len(flat)))
-    if not spread or not _takes(space, field, value, flat):
+    place = _for_rows(space, columns)
+    if value.ndim > 2 or any(size not in (1, n) for size, n in zip(value.shape[::-1], place.shape[::-1], strict=False)):
         return None
-
-    def emit(writer: Writer) -> None:
-        kind = TYPES[to.dtype]
-        values = [writer.tape.cast(writer.load(from_, (0, i), -2), kind) for i in range(len(flat))]
-        for i, each in enumerate(values):
-            column = _from_zero(writer, writer.load(at, (i,), None), field.shape[1])
-            writer.store_at(to, to.offset, field.stride(0), column, field.stride(1), each)
-
-    return field, _operation(emit, [(from_, -2), (at, None)], [(to, -2)], is_single=False)
+    return _entries_put(space, field, 1, place, value.expand(place.shape))
 
 
 def _cells(
@@ -373,43 +346,55 @@ def _cells(
     return axis, [(each, begin + sum(i * stride for i, stride in zip(each, strides, strict=True))) for each in every]
 
 
-def _gathered(space: RowSpace, args: Sequence[Any], kwargs: dict[str, Any], target: Any) -> Plan:
+def _entries_taken(space: RowSpace, table: torch.Tensor, dim: int, index: torch.Tensor, target: Any) -> Plan:
     """Each row's entries of a table by their numbers along another axis."""
-    table, dim, index = args[:3]
-    found = _cells(space, table, dim, index)
-    if found is None or target is not None:
+    if (found := _cells(space, table, dim, index)) is None:
         return None
     axis, cells = found
-    result = torch.empty(index.shape, dtype=table.dtype, device=space.device)
-    from_, to, at = space.array(table), space.array(result, is_own=True), space.array(index)
-    if not _takes(space, result, table, index):
+    result = torch.empty(index.shape, dtype=table.dtype, device=space.device) if target is None else target
+    if not _takes(space, result, table, index) or result.dtype != table.dtype or space.axis(result) != axis:
         return None
+    from_, to, at = space.array(table), space.array(result, is_own=target is None), space.array(index)
 
     def emit(writer: Writer) -> None:
         for each, cell in cells:
-            number = writer.load(at, each, axis)
+            number = _from_zero(writer, writer.load(at, each, axis), table.shape[dim])
             writer.store(to, each, axis, writer.load_at(from_, cell, table.stride(axis), number, table.stride(dim)))
 
     return result, _operation(emit, [(at, axis), (from_, axis)], [(to, axis)], is_single=False)
 
 
-def _scattered(space: RowSpace, args: Sequence[Any], kwargs: dict[str, Any], target: Any) -> Plan:
+def _entries_put(space: RowSpace, table: torch.Tensor, dim: int, index: torch.Tensor, source: torch.Tensor) -> Plan:
     """Write each row's entries of a table by their numbers along another axis."""
-    table, dim, index, source = args[:4]
-    found = None if kwargs or target is not table else _cells(space, table, dim, index)
-    if found is None or not isinstance(source, torch.Tensor) or source.shape != index.shape:
+    if (found := _cells(space, table, dim, index)) is None or not _takes(space, table, source, index):
         return None
     axis, cells = found
     to, from_, at = space.array(table), space.array(source), space.array(index)
-    if not _takes(space, table, source, index) or source.dtype != table.dtype:
-        return None
 
     def emit(writer: Writer) -> None:
-        values = [(each, cell, writer.load(from_, each, axis)) for each, cell in cells]
+        kind = TYPES[to.dtype]
+        values = [(each, cell, writer.tape.cast(writer.load(from_, each, axis), kind)) for each, cell in cells]
         for each, cell, value in values:
-            writer.store_at(to, cell, table.stride(axis), writer.load(at, each, axis), table.stride(dim), value)
+            number = _from_zero(writer, writer.load(at, each, axis), table.shape[dim])
+            writer.store_at(to, cell, table.stride(axis), number, table.stride(dim), value)
 
     return table, _operation(emit, [(at, axis), (from_, axis)], [(to, axis)], is_single=False)
+
+
+def _from_zero(writer: Writer, number: Node, size: int) -> Node:
+    return writer.tape.add(f"({{0}} < 0 ? {{0}} + {size} : {{0}})", number, kind=number.kind)
+
+
+def _gathered(space: RowSpace, args: Sequence[Any], kwargs: dict[str, Any], target: Any) -> Plan:
+    table, dim, index = args[:3]
+    return None if target is not None else _entries_taken(space, table, dim, index, None)
+
+
+def _scattered(space: RowSpace, args: Sequence[Any], kwargs: dict[str, Any], target: Any) -> Plan:
+    table, dim, index, source = args[:4]
+    if kwargs or target is not table or not isinstance(source, torch.Tensor) or source.shape != index.shape:
+        return None
+    return None if source.dtype != table.dtype else _entries_put(space, table, dim, index, source)
 
 
 _WHOLE: dict[str, Callable[..., Plan]] = {

@@ -11,6 +11,7 @@ import numpy as np
 
 from pace_actuators.text import listed
 from pace_envs.from_model.couplings import followed_ratio, followers
+from pace_envs.motor_coordinates import SINGLE
 
 Kind = Literal["position", "velocity", "effort"]
 
@@ -121,7 +122,7 @@ def _transmission(model: mujoco.MjModel, i: int, name: str) -> tuple[str, float,
     kind, gear, row = int(model.actuator_trntype[i]), float(model.actuator_gear[i, 0]), dict[str, float]()
     target = int(model.actuator_trnid[i, 0])
     if kind in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
-        if int(model.jnt_type[target]) not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+        if int(model.jnt_type[target]) not in SINGLE:
             return None
         joint, ratio, rest = model.joint(target).name, gear, 0.0
     elif kind == mujoco.mjtTrn.mjTRN_TENDON:

@@ -12,7 +12,7 @@ import numpy as np
 from pace_envs.closed_loops import ClosedLoops
 from pace_envs.from_model import defaults
 from pace_envs.from_model.actuators import FileDrive, Kind
-from pace_envs.motor_coordinates import DrivenJoints, joint_ranges
+from pace_envs.motor_coordinates import DrivenJoints, joint_ranges, single_joints
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,9 +156,8 @@ def home_posture(model: mujoco.MjModel) -> tuple[np.ndarray, str]:
     if names:
         return model.key_qpos[0].copy(), names[0] or "the first keyframe"
     home = model.qpos0.copy()
-    for j in range(model.njnt):
+    for j in single_joints(model):
         low, high = model.jnt_range[j]
-        single = int(model.jnt_type[j]) in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-        if single and model.jnt_limited[j] and not low < home[model.jnt_qposadr[j]] < high:
+        if model.jnt_limited[j] and not low < home[model.jnt_qposadr[j]] < high:
             home[model.jnt_qposadr[j]] = 0.5 * (low + high)
     return home, ""

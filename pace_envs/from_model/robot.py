@@ -32,7 +32,7 @@ from pace_envs.from_model.scaling import (
     start_values,
 )
 from pace_envs.model_file import ModelFile, compile_model, read_model_file
-from pace_envs.motor_coordinates import DrivenJoints, Rows, add_motors
+from pace_envs.motor_coordinates import DrivenJoints, Rows, add_motors, single_joints
 from pace_envs.robot_spec import load_robot_spec
 from pace_envs.simulation import SimulationCfg
 from pace_envs.tasks.pace import ExcitationCfg, PaceCfg, PaceSim2realEnvCfg, PaceSim2realSceneCfg
@@ -237,9 +237,8 @@ def _to_drive(model: mujoco.MjModel, file: ModelFile) -> list[str]:
     """What to drive where the file has no actuators: joints that it names, else all that follow no other."""
     if file.urdf is not None and file.urdf.driven:
         return [name for name in (model.joint(j).name for j in range(model.njnt)) if name in file.urdf.driven]
-    single = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
     follow = followers(model)
-    return [model.joint(j).name for j in range(model.njnt) if int(model.jnt_type[j]) in single and j not in follow]
+    return [model.joint(j).name for j in single_joints(model) if j not in follow]
 
 
 def _with_motors(names: Sequence[str], motors: Rows) -> list[str]:
@@ -271,9 +270,8 @@ def _home_positions(robot: Robot) -> dict[str, float]:
     model = robot.model
     driven = {joint for facts in robot.joints for joint in facts.joints}
     result = {facts.name: facts.home for facts in robot.joints}
-    for j in range(model.njnt):
-        single = int(model.jnt_type[j]) in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-        if single and model.joint(j).name not in driven:
+    for j in single_joints(model):
+        if model.joint(j).name not in driven:
             result[model.joint(j).name] = float(robot.home[model.jnt_qposadr[j]])
     return {re.escape(name): value for name, value in result.items() if value}
 
@@ -313,9 +311,8 @@ def _assumptions(joints: Sequence[JointFacts], key: str, model: mujoco.MjModel, 
 
 def _beside_drives(model: mujoco.MjModel, driven: Sequence[str]) -> list[str]:
     """What the file lets act on the joints beside their drives: it stays in the model."""
-    single = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
     follow, notes = followers(model), []
-    joints = [j for j in range(model.njnt) if int(model.jnt_type[j]) in single]
+    joints = single_joints(model)
     loose = [model.joint(j).name for j in joints if j not in follow and model.joint(j).name not in driven]
     if loose:
         notes.append(

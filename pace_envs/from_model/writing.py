@@ -44,20 +44,16 @@ HOME = _HOME_
 LONGEST_DELAY = _DELAY_  # [control steps]
 
 
-def column(i: int) -> list[float]:
-    """One value of every joint."""
-    return [row[i] for row in JOINTS.values()]
-
-
 def env_cfg() -> PaceSim2realEnvCfg:
     """The identification environment."""
     names = tuple(JOINTS)
+    kp, kd, effort, speed, centre, amplitude, armature, viscous, friction, bias = map(list, zip(*JOINTS.values()))
     drives = PaceDCMotorCfg(
         joint_names_expr=[re.escape(name) for name in names],
-        stiffness=column(0),
-        damping=column(1),
-        effort_limit=column(2),
-        velocity_limit=column(3),
+        stiffness=kp,
+        damping=kd,
+        effort_limit=effort,
+        velocity_limit=speed,
         delay=0.0,  # with max_delay alone the drive would act with that delay
         max_delay=LONGEST_DELAY,
         implicit=_IMPLICIT_,  # whether the loop runs continuously; else it holds its torque between two commands
@@ -74,10 +70,10 @@ def env_cfg() -> PaceSim2realEnvCfg:
         couplings=_COUPLINGS_,
     )
     bounds = {
-        "armature": [(1e-5 * a, a) for a in column(6)],
-        "viscous_friction": [(0.0, v) for v in column(7)],
-        "friction": [(0.0, v) for v in column(8)],
-        "encoder_bias": [(-b, b) for b in column(9)],
+        "armature": [(1e-5 * most, most) for most in armature],
+        "viscous_friction": [(0.0, most) for most in viscous],
+        "friction": [(0.0, most) for most in friction],
+        "encoder_bias": [(-most, most) for most in bias],
         "delay": (0.0, LONGEST_DELAY),
     }
     return PaceSim2realEnvCfg(
@@ -89,16 +85,16 @@ def env_cfg() -> PaceSim2realEnvCfg:
             joint_order=names,
             bounds=bounds,
             excitation=ExcitationCfg(
-                bias=tuple(centre / size for centre, size in zip(column(4), column(5), strict=True)),
+                bias=tuple(middle / size for middle, size in zip(centre, amplitude, strict=True)),
                 direction=(1.0,) * len(names),
-                scale=tuple(column(5)),
+                scale=tuple(amplitude),
             ),
             sample_params=_SAMPLE_,
             start_params={  # of a fit: a tenth of the upper bounds
                 "delay": 0.1 * LONGEST_DELAY,
                 **{
-                    group: dict(zip(names, [0.1 * upper for upper in column(i)], strict=True))
-                    for i, group in ((6, "armature"), (7, "viscous_friction"), (8, "friction"))
+                    group: {name: 0.1 * pair[1] for name, pair in zip(names, bounds[group], strict=True)}
+                    for group in ("armature", "viscous_friction", "friction")
                 },
             },
             physics_steps=_STEPS_,  # in a control step of a fit

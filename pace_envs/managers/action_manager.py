@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from pace_envs.indexing import checked_values
-from pace_envs.managers.manager_base import term_items
+from pace_envs.managers.manager_base import ClassTerms
 
 if TYPE_CHECKING:
     from pace_envs.manager_based_env import ManagerBasedEnv
@@ -51,12 +51,12 @@ class ActionTerm:
         """Forget the state of some environments."""
 
 
-class ActionManager:
+class ActionManager(ClassTerms[ActionTerm]):
     """Splits the action among its terms."""
 
     def __init__(self, cfg: Any, env: ManagerBasedEnv):
         """Build the terms of a dict of name to configuration."""
-        self._terms = {name: term.class_type(term, env) for name, term in term_items(cfg).items()}
+        super().__init__(cfg, env, "action")
         self._sizes = [term.action_dim for term in self._terms.values()]
         self.action = torch.zeros(env.num_envs, sum(self._sizes), dtype=env.dtype, device=env.device)
         self.prev_action, self._given = self.action.clone(), self.action.clone()
@@ -67,23 +67,9 @@ class ActionManager:
         return self.action.shape[1]
 
     @property
-    def active_terms(self) -> list[str]:
-        """Names of the terms."""
-        return list(self._terms)
-
-    @property
-    def terms(self) -> list[ActionTerm]:
-        """The terms."""
-        return list(self._terms.values())
-
-    @property
     def takes_masks(self) -> bool:
         """Whether :meth:`reset` takes environments that are not counted, (num_envs,) bool, too."""
         return all(type(term).reset is ActionTerm.reset for term in self._terms.values())
-
-    def get_term(self, name: str) -> ActionTerm:
-        """The term of that name."""
-        return self._terms[name]
 
     def process_action(self, action: torch.Tensor) -> None:
         """Take an action, (num_envs, total_action_dim), where either may be 1, and hand it to the terms."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from pace_envs.managers.manager_base import term_items
+from pace_envs.managers.manager_base import ClassTerms
 
 if TYPE_CHECKING:
     from pace_envs.manager_based_env import ManagerBasedEnv
@@ -89,39 +89,21 @@ class CommandTerm:
         """Change the command with the state (none by default)."""
 
 
-class CommandManager:
+class CommandManager(ClassTerms[CommandTerm]):
     """Holds the command terms."""
 
     def __init__(self, cfg: Any, env: ManagerBasedEnv):
         """Build the terms of a dict of name to configuration."""
-        self._terms: dict[str, CommandTerm] = {
-            name: term.class_type(term, env) for name, term in term_items(cfg).items()
-        }
-
-    @property
-    def active_terms(self) -> list[str]:
-        """Names of the terms."""
-        return list(self._terms)
+        super().__init__(cfg, env, "command")
 
     def get_command(self, name: str) -> torch.Tensor:
         """The present command of a term, (num_envs, dim)."""
         return self.get_term(name).command
 
-    def get_term(self, name: str) -> CommandTerm:
-        """The term of that name."""
-        if name not in self._terms:
-            raise KeyError(f"There is no command {name!r}. Available: {', '.join(self._terms) or 'none'}.")
-        return self._terms[name]
-
     def compute(self, dt: float) -> None:
         """Let time pass."""
         for term in self._terms.values():
             term.compute(dt)
-
-    @property
-    def terms(self) -> list[CommandTerm]:
-        """The terms."""
-        return list(self._terms.values())
 
     @property
     def takes_masks(self) -> bool:

@@ -85,9 +85,9 @@ Number = float | torch.Tensor
 """A number to log; on a GPU a tensor without dimensions, so that nothing waits for it before it is written."""
 
 
-def as_number(value: torch.Tensor) -> Number:
-    """A tensor without dimensions as a number to log."""
-    return value.item() if value.device.type == "cpu" else value
+def as_numbers(log: Mapping[str, torch.Tensor]) -> dict[str, Number]:
+    """Tensors without dimensions as numbers to log."""
+    return {name: value.item() if value.device.type == "cpu" else value for name, value in log.items()}
 
 
 def state_only(func: Callable[..., Any]) -> Callable[..., Any]:
@@ -101,6 +101,7 @@ def state_only(func: Callable[..., Any]) -> Callable[..., Any]:
 
 
 CfgT = TypeVar("CfgT", bound=ManagerTermBaseCfg)
+TermT = TypeVar("TermT")
 
 
 class Term(Generic[CfgT]):
@@ -176,6 +177,35 @@ class ManagerBase(Generic[CfgT]):
         for term in self.terms:
             term.reset(env_ids)
         return {}
+
+
+class ClassTerms(Generic[TermT]):
+    """Terms that are objects of their configurations' classes, by name."""
+
+    def __init__(self, cfg: Any, env: ManagerBasedEnv, what: str):
+        """Build the terms of a dict, or of an object whose attributes are their configurations.
+
+        Args:
+            what: What a term is called in messages.
+        """
+        self._terms: dict[str, TermT] = {name: term.class_type(term, env) for name, term in term_items(cfg).items()}
+        self._what = what
+
+    @property
+    def active_terms(self) -> list[str]:
+        """Names of the terms."""
+        return list(self._terms)
+
+    @property
+    def terms(self) -> list[TermT]:
+        """The terms."""
+        return list(self._terms.values())
+
+    def get_term(self, name: str) -> TermT:
+        """The term of that name."""
+        if name not in self._terms:
+            raise KeyError(f"There is no {self._what} {name!r}. Available: {', '.join(self._terms) or 'none'}.")
+        return self._terms[name]
 
 
 def term_items(cfg: Any) -> dict[str, Any]:

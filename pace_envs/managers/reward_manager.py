@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from pace_envs.managers.manager_base import ManagerBase, ManagerTermBaseCfg, Number, as_number
+from pace_envs.indexing import mask_of
+from pace_envs.managers.manager_base import ManagerBase, ManagerTermBaseCfg, Number, as_numbers
 
 if TYPE_CHECKING:
     from pace_envs.manager_based_env import ManagerBasedEnv
@@ -69,9 +70,5 @@ class RewardManager(ManagerBase[RewardTermCfg]):
 
     def reset(self, env_ids: torch.Tensor) -> dict[str, Number]:
         """Clear the sums of some environments; returns each term's mean per second of a full episode."""
-        log: dict[str, Number] = {}
-        for name, total in self._sums.items():
-            log[f"Episode_Reward/{name}"] = as_number(total[env_ids].mean() / self._max_episode_length_s)
-            total[env_ids] = 0.0
         super().reset(env_ids)
-        return log
+        return as_numbers(self.reset_where(mask_of(env_ids, self._reward)))

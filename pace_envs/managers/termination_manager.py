@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from pace_envs.managers.manager_base import ManagerBase, ManagerTermBaseCfg, Number, as_number
+from pace_envs.indexing import mask_of
+from pace_envs.managers.manager_base import ManagerBase, ManagerTermBaseCfg, Number, as_numbers
 
 if TYPE_CHECKING:
     from pace_envs.manager_based_env import ManagerBasedEnv
@@ -62,6 +63,5 @@ class TerminationManager(ManagerBase[TerminationTermCfg]):
 
     def reset(self, env_ids: torch.Tensor) -> dict[str, Number]:
         """Reset class terms; returns how many of these environments each term ended."""
-        log = {f"Episode_Termination/{name}": as_number(last[env_ids].sum()) for name, last in self._last.items()}
         super().reset(env_ids)
-        return log
+        return as_numbers(self.reset_where(mask_of(env_ids, self.terminated)))

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from pace_envs.indexing import mask_of
 from pace_envs.managers import ManagerTermBase, ManagerTermBaseCfg
 from pace_envs.mdp.commands import UniformVelocityCommand
 
@@ -31,7 +32,6 @@ class command_range_by_tracking(ManagerTermBase):
         self._command.scale = float(cfg.params.get("start", 0.5))
         self._window = max(env.num_envs // 4, 1)
         self._earned = torch.zeros((), dtype=env.dtype, device=env.device)
-        self._episodes = 0
         self._ended = torch.zeros((), dtype=env.dtype, device=env.device)
 
     def __call__(  # type: ignore[override]
@@ -43,17 +43,10 @@ class command_range_by_tracking(ManagerTermBase):
         start: float = 0.5,
         growth: float = 0.1,
         threshold: float = 0.7,
-    ) -> float:
+    ) -> torch.Tensor:
         """Judge the episodes that ended; returns the part of the ranges that is drawn from."""
-        full = env.reward_manager.get_term_cfg(reward_name).weight * env.max_episode_length_s
-        self._earned += env.reward_manager.episode_sums[reward_name][env_ids].sum() / full
-        self._episodes += len(env_ids)
-        if self._episodes >= self._window:
-            if self._earned / self._episodes > threshold:
-                self._command.scale = min(self._command.scale + growth, 1.0)
-            self._earned.zero_()
-            self._episodes = 0
-        return self._command.scale
+        done = mask_of(env_ids, env.episode_length_buf)
+        return self.where(env, done, command_name, reward_name, start, growth, threshold)
 
     def where(
         self,

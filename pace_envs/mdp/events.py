@@ -14,12 +14,6 @@ from pace_envs.managers import SceneEntityCfg, state_only
 from pace_envs.quaternions import from_euler, multiply
 
 if TYPE_CHECKING:
-    from pace_envs.manager_based_env import ManagerBasedEnv
-
-if TYPE_CHECKING:
-    from pace_envs.manager_based_env import ManagerBasedEnv
-
-if TYPE_CHECKING:
     from pace_envs.articulation import Articulation
     from pace_envs.manager_based_env import ManagerBasedEnv
 

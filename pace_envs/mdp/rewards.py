@@ -14,10 +14,6 @@ if TYPE_CHECKING:
     from pace_envs.manager_based_env import ManagerBasedEnv
     from pace_envs.manager_based_rl_env import ManagerBasedRLEnv
 
-if TYPE_CHECKING:
-    from pace_envs.manager_based_env import ManagerBasedEnv
-    from pace_envs.manager_based_rl_env import ManagerBasedRLEnv
-
 
 _ROBOT = SceneEntityCfg()
 
