@@ -41,7 +41,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
-from pace_optim.recording.moving_base import Carried
+from pace_optim.recording.carried import Carried
 
 _BLOCK = 160
 """Control steps of a phase whose errors are looked at together: those further apart are taken for independent."""

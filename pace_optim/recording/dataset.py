@@ -13,7 +13,7 @@ import torch
 
 from pace_actuators.text import listed
 from pace_optim.recording import Recording, validation_start, with_columns
-from pace_optim.recording.moving_base import GRAVITY, Carried, force_noise, measured_motion, read_earlier
+from pace_optim.recording.carried import GRAVITY, Carried, force_noise, measured_motion, read_earlier
 from pace_optim.recording.noise import LEAST_NOISE, noise_floor, noise_variance
 from pace_optim.recording.time_base import interpolate_linear
 from pace_optim.recording.torque import TorqueChannel

@@ -19,8 +19,8 @@ from pace_optim.joints.simulation.link_states import LinkChange
 from pace_optim.problem.free_phases import FreePhases
 from pace_optim.problem.problem import Problem
 from pace_optim.recording import Recording
+from pace_optim.recording.carried import Carried
 from pace_optim.recording.dataset import Dataset
-from pace_optim.recording.moving_base import Carried
 from pace_optim.recording.noise import noise_floor
 
 if TYPE_CHECKING:

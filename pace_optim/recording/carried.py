@@ -1,4 +1,4 @@
-"""Recordings of a robot whose base moves: how its model's frame moves, and when its joints move freely."""
+"""What recordings show of joints that a moving base carries; `problem/moving_base` brings it onto a robot's model."""
 
 from __future__ import annotations
 
