@@ -346,6 +346,7 @@ def read_csv(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
         series, _, joint = column.partition("/")
         columns.setdefault(series, {})[joint] = index
     joints = list(columns.get("dof_pos", {}))
+    named = {**BASE_COLUMNS, "real_ee_pose": POSE_COLUMNS[: len(columns.get("real_ee_pose", {}))]}
     fields: dict[str, Any] = {}
     two_clocks = "des_time" in columns
     for series, index_of in columns.items():
@@ -357,12 +358,9 @@ def read_csv(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
             indices = list(index_of.values())
             values = np.stack([_numbers(path, header[i], own, i) for i in indices], axis=1)
             fields[series] = values[:, 0] if len(indices) == 1 else values
-        elif series == "real_ee_pose" and set(index_of) in (set(POSE_COLUMNS[:3]), set(POSE_COLUMNS)):
-            names = POSE_COLUMNS[: len(index_of)]
-            fields[series] = np.stack([_numbers(path, f"{series}/{c}", own, index_of[c]) for c in names], axis=1)
-        elif series in BASE_COLUMNS and set(index_of) == set(BASE_COLUMNS[series]):
-            names = BASE_COLUMNS[series]
-            fields[series] = np.stack([_numbers(path, f"{series}/{c}", own, index_of[c]) for c in names], axis=1)
+        elif series in named and set(index_of) == set(named[series]):
+            parts = [_numbers(path, f"{series}/{part}", own, index_of[part]) for part in named[series]]
+            fields[series] = np.stack(parts, axis=1)
         elif series in FEET_SERIES and "" not in index_of:
             fields |= _of_feet(path, series, index_of, own, fields.get("feet"))
         elif series in JOINT_SERIES and joints:
