@@ -7,9 +7,9 @@ from pathlib import Path
 
 from pace_actuators.files import refuse_taken
 from pace_actuators.text import listed
-from pace_optim.recording import SUFFIXES, save_recording, written_files
+from pace_optim.recording import SUFFIXES, Recording, save_recording, written_files
 from pace_optim.recording.files import unused_facts
-from pace_optim.recording.logs import LogReader, Robot, is_log, read_map, with_rate, write_map
+from pace_optim.recording.logs import ColumnMap, LogReader, Robot, is_log, read_map, with_rate, write_map
 from pace_optim.terminal.cli import make_parser
 from pace_optim.terminal.options import (
     add_common_options,
@@ -40,20 +40,20 @@ def main() -> None:
     path = Path("+".join(args.log))
     columns = with_rate(read_map(Path(args.columns)) if args.columns else None, args.rate)
     reader = LogReader([str(path)], columns, args.facts)
+    parts: Sequence[tuple[Recording, ColumnMap | None]]
     if not is_log(path, columns):
         found = reader.recordings(str(path), Robot())
         print(f"{path}: is a recording already, of {', '.join(found[0].joint_names) or 'joints without names'}.")
         parts = [(recording, columns) for recording in found]
     else:
         robot = _robot(args.task, args.log, args.columns)
-        each = reader.understood(str(path), robot)
+        parts = reader.understood(str(path), robot)
         for line in reader.lines():
             print(line)
-        if absent := [name for name in robot.joint_names if name not in each[0].recording.joint_names]:
+        if absent := [name for name in robot.joint_names if name not in parts[0][0].joint_names]:
             print(f"  not in the log: {listed(absent)}; a fit holds them")
-        if len(each) > 1:
-            print(f"  {len(each)} episodes")
-        parts = [(one.recording, one.columns) for one in each]
+        if len(parts) > 1:
+            print(f"  {len(parts)} episodes")
     if left := unused_facts(args.log, args.facts):
         print(f"note: {left}", file=sys.stderr)
     targets = _targets(Path(args.output), len(parts)) if args.output else []

@@ -9,7 +9,6 @@ if sys.platform == "linux" and not HAS_SCREEN and find_library("EGL"):
     os.environ.setdefault("MUJOCO_GL", "egl")  # before MuJoCo is imported: films need no screen
 
 from pace_envs.rl import PlaySettings, RunSettings, load_cfg, play  # noqa: E402
-from pace_optim.run.training_replay import replay_in_training  # noqa: E402
 from pace_optim.terminal.cli import make_parser  # noqa: E402
 from pace_optim.terminal.options import (  # noqa: E402
     add_common_options,
@@ -50,6 +49,8 @@ def main() -> None:
     args = take_common_options(vars(parser.parse_args()))
     run, physics_dt = args.pop("replay"), args.pop("physics_dt")
     if run is not None:
+        from pace_optim.run.training_replay import replay_in_training  # as large as all of a fit
+
         training = RunSettings(task=args["task"] or "", identified=run, physics_dt=physics_dt)
         print(*replay_in_training(run, load_cfg(training) if args["task"] else None).table, sep="\n")
         return

@@ -15,7 +15,7 @@ from pace_optim.estimate.error_bars.assessment import trajectories
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.problem import Problem
 from pace_optim.recording import Drive, Recording
-from pace_optim.recording.moving_base import part_of_phase
+from pace_optim.recording.carried import part_of_phase
 from pace_optim.run.open import open_problem
 from pace_optim.run.result import FitResult
 from pace_optim.run.settings import FitSettings

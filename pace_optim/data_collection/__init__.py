@@ -6,7 +6,6 @@
 
 from .cfg import CollectionCfg
 from .collect import Collection, collect
-from .command_line import cfg_from_args, make_collection_parser
 from .plot import plot_motion
 from .simulate import Encoder, Simulated, simulate, true_parameters
 
@@ -15,9 +14,7 @@ __all__ = [
     "CollectionCfg",
     "Encoder",
     "Simulated",
-    "cfg_from_args",
     "collect",
-    "make_collection_parser",
     "plot_motion",
     "simulate",
     "true_parameters",

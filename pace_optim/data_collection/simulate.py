@@ -12,6 +12,7 @@ import torch
 
 from pace_envs.tasks.pace import PaceCfg
 from pace_optim.motion.signals import Trajectory
+from pace_optim.problem.drive_steps import of_joints
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.rollout import Rollout
 from pace_optim.recording import Drive, Load, Recording, conform_recording
@@ -143,7 +144,7 @@ def simulate(
         if not encoder.is_exact:
             _show_to_controllers(robot, position[k] - reading[k])
     _check_finite(position, trajectories)
-    drive_in_force = _drive_in_force(robot)
+    drive_in_force = Drive(**{field.name: of_joints(env, field.name) for field in fields(Drive)})
     return [
         Simulated(
             recording=replace(
@@ -200,15 +201,6 @@ def _show_to_controllers(robot: Articulation, offset: np.ndarray) -> None:
     values = torch.as_tensor(offset)
     for actuator in robot.actuators.values():
         actuator.update_encoder_bias(values[:, actuator.joint_indices])
-
-
-def _drive_in_force(robot: Articulation) -> Drive:
-    values = {field.name: np.zeros(robot.num_joints) for field in fields(Drive)}
-    for actuator in robot.actuators.values():
-        for name, array in values.items():
-            where = actuator.joint_indices
-            array[where if isinstance(where, slice) else np.asarray(where)] = getattr(actuator, name)[0].numpy()
-    return Drive(**values)
 
 
 def _check_finite(position: np.ndarray, trajectories: Sequence[Trajectory]) -> None:

@@ -12,7 +12,7 @@ from pace_actuators.files import write_atomically
 from pace_actuators.text import listed
 from pace_envs.identified import doubts_of_fit
 from pace_envs.link_inertia import NAMES
-from pace_optim.export.configs import cfg_python, isaaclab_python, mjlab_python
+from pace_optim.export.configs import cfg_python, extra_parameters, isaaclab_python, mjlab_python
 from pace_optim.export.mjcf import mjcf, motors_of, pulled_notes
 from pace_optim.export.mjlab_native import mjlab_native_python
 from pace_optim.export.newton import newton_python
@@ -50,7 +50,8 @@ def _json(drives: IdentifiedDrives) -> tuple[str, list[str]]:
         "drive": {name: dict(values) for name, values in drives.drive.items()},
         "effects": [effect.label for effect in drives.effects],
         "links": {name: asdict(link) for name, link in drives.links.items()},
-        "parameters": {name: drives.determined(name, joints) for name in names},
+        "parameters": {name: drives.determined(name, joints) for name in names}
+        | {name: dict(drives.parameters[name]) for name in extra_parameters(drives)},
         **({"couplings": motors} if (motors := motors_of(drives)) else {}),
     }
     return json.dumps(content, indent=2) + "\n", []

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any
 
 from pace_actuators import IdentifiedAt, IdentifiedDrives, PaceDCMotorCfg
+from pace_actuators.base_parameters import BASE_PARAMETERS
 from pace_actuators.effects import EffectCfg
 from pace_actuators.identified import DRIVE_FIELDS, RATE_FLAGS
 from pace_actuators.representable import HERE, ISAACLAB, MJLAB, World, check_representable, link_notes
 from pace_envs.generated_python import Call, Word, python_page
 from pace_envs.identified import load_identified_cfg
+from pace_envs.link_inertia import NAMES
+from pace_envs.tasks.pace import TORQUE_OFFSET, TORQUE_SCALE
 
 _DELAY = (
     "The delay is in seconds: the drive converts it to its own control steps. At another physics step than "
@@ -31,8 +34,7 @@ def drive_groups(drives: IdentifiedDrives) -> dict[str, PaceDCMotorCfg]:
             kept = (*(name for name in DRIVE_FIELDS if name not in drives.drive), "drive_dt", *RATE_FLAGS)
             configured = {name: getattr(drive, name) for name in kept}
             found = drives.cfg_fields([re.escape(joint) for joint in own])
-            result[group] = PaceDCMotorCfg(**configured | {"joint_names_expr": drive.joint_names_expr} | found)
-            result[group] = replace(result[group], joint_names_expr=drive.joint_names_expr)
+            result[group] = PaceDCMotorCfg(**configured | found | {"joint_names_expr": drive.joint_names_expr})
     return result
 
 
@@ -98,7 +100,7 @@ ACTUATORS = {name: PaceDCMotorActuatorCfg(motor=motor) for name, motor in MOTORS
 
 def _page(drives: IdentifiedDrives, world: World, template: str, extra: Mapping[str, Any]) -> tuple[str, list[str]]:
     notes = [_DELAY.format(dt=1e3 * drives.at.physics_dt), *check_representable(drives, world)]
-    notes += link_notes(drives) if world is HERE else []
+    notes += [*(link_notes(drives) if world is HERE else []), *extra_notes(drives)]
     if world.friction_hook and _is_implicit(drives):
         notes.append(
             f"the drive's controller runs continuously (implicit), as friction of each step: {world.friction_hook}."
@@ -111,6 +113,22 @@ def _page(drives: IdentifiedDrives, world: World, template: str, extra: Mapping[
 def about(drives: IdentifiedDrives, where: str, notes: Sequence[str]) -> str:
     """A page's docstring: of which fit it is, for what, and what it does not hold."""
     return "\n".join([f"Drives identified with {drives.task}{where}: {drives.path.parent.name}.", "", *notes, ""])
+
+
+def extra_parameters(drives: IdentifiedDrives) -> list[str]:
+    """Names of the parameters that the task itself adds (``PaceCfg.extra_parameters``)."""
+    of_effects = {f"{e.effect_class.name}.{p.name}" for e in drives.effects for p in e.effect_class.parameters}
+    known = {*BASE_PARAMETERS, *of_effects, *NAMES, TORQUE_SCALE, TORQUE_OFFSET}
+    return [name for name in drives.parameters if name not in known]
+
+
+def extra_notes(drives: IdentifiedDrives) -> list[str]:
+    """That no drive has those parameters, in words."""
+    return [
+        f"{name} is an extra parameter of the task: omitted. The robot moves differently without it. Its values are in "
+        "result.json; write them as the task's apply does."
+        for name in extra_parameters(drives)
+    ]
 
 
 def _is_implicit(drives: IdentifiedDrives) -> bool:

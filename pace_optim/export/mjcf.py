@@ -29,7 +29,7 @@ from pace_optim.export.plain_drive import (
     JOINT_EFFECTS,
     PlainDrive,
     effect_notes,
-    is_undetermined,
+    joint_values,
     plain_drives,
     soft_frictions,
 )
@@ -57,11 +57,11 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
     driven = int(robot.dof_columns[0])
     for element in [*spec.joints, *spec.tendons]:  # what has no drive rubs as in the fit too
         element.solref_friction, element.solimp_friction = model.dof_solref[driven], model.dof_solimp[driven]
+    attributes = {each.name: each.mujoco for each in BASE_PARAMETERS.values() if each.mujoco}
     for name in robot.joint_names:
         joint = _carrier(spec, name)  # the base parameters: an elastic joint's inertia sits in the drive while it runs
-        for parameter in BASE_PARAMETERS.values():
-            if parameter.mujoco and not is_undetermined(drives, parameter.name, name):
-                _set(joint, parameter.mujoco, drives.values(parameter.name, [name])[name])
+        for attribute, value in joint_values(drives, name, attributes).items():
+            _set(joint, attribute, value)
         joint.actfrcrange = [0.0, 0.0]  # none: the drive has its limit
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
     if spec.meshes:
@@ -91,11 +91,10 @@ def _compensated(spec: mujoco.MjSpec, drives: IdentifiedDrives, notes: list[str]
     """Let MuJoCo compensate the weight of all bodies if the drives do so alike; returns the effect that it holds."""
     name = GravityCompensation.name
     shares = drives.parameters.get(f"{name}.share", {})
-    alike = set(shares.values())
-    if len(alike) != 1 or not ({ALL} == set(shares) or set(drives.joint_names) <= set(shares)):
+    if len(set(shares.values())) != 1 or not ({ALL} == set(shares) or set(drives.joint_names) <= set(shares)):
         return []
     for body in spec.bodies[1:]:
-        body.gravcomp = alike.copy().pop()
+        body.gravcomp = next(iter(shares.values()))
     notes.append(f"{name} is gravcomp of all bodies: of their weight, not of other joints' motion; beside the limits.")
     return [name]
 

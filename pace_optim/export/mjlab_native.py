@@ -16,7 +16,7 @@ from pace_optim.export.plain_drive import (
     GAIN_EFFECTS,
     PlainDrive,
     effect_notes,
-    is_undetermined,
+    joint_values,
     plain_drives,
     soft_frictions,
     whole_steps_note,
@@ -98,9 +98,7 @@ def _fields(drives: IdentifiedDrives, joint: str, drive: PlainDrive) -> dict[str
         values |= {"stiffness": drive.stiffness, "saturation_effort": drive.saturation_effort}
         values["velocity_limit"] = drive.velocity_limit
     names = {"armature": "armature", "friction": "frictionloss", "viscous_friction": "viscous_damping"}
-    for parameter, name in names.items():
-        if not is_undetermined(drives, parameter, joint):
-            values[name] = drives.values(parameter, [joint])[joint]
+    values |= joint_values(drives, joint, names)
     return {
         "target_names_expr": (_expression(joint),),
         **{name: digits(v) for name, v in values.items()},

@@ -15,7 +15,7 @@ from pace_optim.export.plain_drive import (
     GAIN_EFFECTS,
     PlainDrive,
     effect_notes,
-    is_undetermined,
+    joint_values,
     plain_drives,
     whole_steps_note,
 )
@@ -35,11 +35,7 @@ def newton_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
     notes = [*notes, *_notes(drives, plain), *effect_notes(drives, HELD), *link_notes(drives)]
     names = {"armature": "armature", "friction": "friction", "viscous_friction": "damping"}
     joints = {
-        joint: {
-            name: drives.values(parameter, [joint])[joint]
-            for parameter, name in names.items()
-            if not is_undetermined(drives, parameter, joint)
-        }
+        joint: joint_values(drives, joint, names)
         | ({"stiffness": drive.spring, "rest_q": drive.rest} if drive.spring else {})
         for joint, drive in plain.items()
     }

@@ -9,12 +9,11 @@ from dataclasses import dataclass, replace
 import torch
 
 from pace_actuators import IdentifiedDrives
-from pace_actuators.drive_result import ALL
 from pace_actuators.effects import Effect
 from pace_actuators.effects.fading_friction import SoftFriction, solver_parameters, step_of_constraint
 from pace_actuators.joint_values import resolve_joint_values
 from pace_actuators.representable import of_the_recording
-from pace_optim.export.configs import drive_groups
+from pace_optim.export.configs import drive_groups, extra_notes
 
 GAIN_EFFECTS = ("proportional_gain", "derivative_gain", "torque_gain", "torque_limit", "torque_speed_limit")
 """Effects that are other gains and limits of the same drive."""
@@ -142,7 +141,7 @@ def plain_drives(drives: IdentifiedDrives) -> tuple[dict[str, PlainDrive], list[
                 effort_limit=min(found["effort_limit"][i], own["torque_limit"].get(joint, math.inf)) * gain,
                 saturation_effort=found["saturation_effort"][i] if line else math.inf,
                 velocity_limit=found["velocity_limit"][i] if line else math.inf,
-                encoder_bias=0.0 if is_undetermined(drives, "encoder_bias", joint) else found["encoder_bias"][i],
+                encoder_bias=found["encoder_bias"][i] if drives.determined("encoder_bias", [joint]) else 0.0,
                 delay_s=drives.delay_s + early if commands else 0.0,
                 run_dt=0.0 if cfg.implicit else cfg.drive_dt or drives.at.control_dt,
                 second_order=cfg.second_order,
@@ -183,7 +182,7 @@ def soft_frictions(
 
 
 def effect_notes(drives: IdentifiedDrives, held: Sequence[str]) -> list[str]:
-    """Which effects are held and which are not, in words.
+    """Which effects are held and which are not, and which parameters are of the task alone, in words.
 
     Args:
         held: Names of the effects that the format holds.
@@ -199,12 +198,17 @@ def effect_notes(drives: IdentifiedDrives, held: Sequence[str]) -> list[str]:
                 f"{kind.name} ({_what(kind)}): omitted. The robot moves differently without it. PaceDCMotor has it, in "
                 "any simulator (--format mjcf --joints_only)."
             )
-    return notes
+    return [*notes, *extra_notes(drives)]
 
 
-def is_undetermined(drives: IdentifiedDrives, parameter: str, joint: str) -> bool:
-    """Whether the recordings say nothing of a value, so that it kept its prior and is not exported."""
-    return not {f"{parameter}/{joint}", f"{parameter}/{ALL}"}.isdisjoint(drives.undetermined)
+def joint_values(drives: IdentifiedDrives, joint: str, names: Mapping[str, str]) -> dict[str, float]:
+    """A joint's parameters that the recordings determine: others kept their priors, and are not exported.
+
+    Args:
+        names: What a format calls them, by parameter.
+    """
+    found = {name: drives.determined(parameter, [joint]) for parameter, name in names.items()}
+    return {name: values[joint] for name, values in found.items() if values}
 
 
 def _of_effect(drives: IdentifiedDrives, name: str, parameter: str = "") -> dict[str, float]:

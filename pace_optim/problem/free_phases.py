@@ -42,7 +42,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from pace_optim.recording.moving_base import Carried
+from pace_optim.recording.carried import Carried
 
 _BLOCK = 160
 """Control steps of a phase whose errors are looked at together: those further apart are taken for independent."""

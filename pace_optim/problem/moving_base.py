@@ -24,9 +24,9 @@ from pace_optim.problem.inverse_dynamics import LinkMotion, bounded_least_square
 from pace_optim.problem.kinematic_trees import independent_trees
 from pace_optim.problem.log_and_robot import asked_torque, gains
 from pace_optim.recording import Recording
+from pace_optim.recording.carried import free_phases, standing_feet
 from pace_optim.recording.data import ImuPose
 from pace_optim.recording.keys import did_you_mean
-from pace_optim.recording.moving_base import free_phases, standing_feet
 
 
 def on_moving_base(recording: Recording, env: ManagerBasedEnv) -> Recording:

@@ -85,7 +85,7 @@ def read_logs(
     begins. Two files that are the halves of one log (states, commands) are joined.
 
     Args:
-        groups: Files and folders, each as :func:`pace_optim.recording.logs.load_recordings` takes it.
+        groups: Files and folders, each as :class:`pace_optim.recording.logs.LogReader` takes it.
         joints: Regular expression of the joints that are to be identified; ``None``: those of the recordings.
         columns: Column map of the logs among them; ``None``: guessed.
         facts: JSON file of what is true of all of them, where they do not state it.

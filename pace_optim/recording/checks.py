@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -76,11 +77,11 @@ def check_recording(
         real_ee_pose=None if pose is None else _pose(pose, len(time), source),
         **_base(fields, len(time), source),
         time_origin=_origin(fields.get("time_origin"), origin, source),
-        drive=drive_of(fields, joint_names, _commanded(series, num_joints), source),
         load=load_of(fields, source),
         notes=tuple(notes),
         source=source,
     )
+    recording = replace(recording, drive=drive_of(fields, joint_names, recording.is_commanded, source))
     _check_commands(recording)
     return recording
 
@@ -306,12 +307,6 @@ def _check_finite(key: str, array: np.ndarray, joint_names: tuple[str, ...], sou
         f"{source}: {key} has {len(faults)} values that are NaN or infinite, the first {where}; expected "
         "finite numbers. Remove those samples (from every series, with their time), or cut the file there."
     )
-
-
-def _commanded(series: Mapping[str, np.ndarray], num_joints: int) -> np.ndarray:
-    """Which columns have commands of any kind, (n,) bool."""
-    told = [~np.isnan(series[key]).all(axis=0) for key in COMMAND_SERIES if key in series]
-    return np.any(told, axis=0) if told else np.zeros(num_joints, dtype=bool)
 
 
 def _check_commands(recording: Recording) -> None:

@@ -16,7 +16,14 @@ from .checks import MIN_SAMPLES, refuse_uncommanded
 from .commands import GRID_COMMANDS, command_interval, commands_on_grid, timing_note
 from .data import Drive, Recording
 from .keys import COMMAND_SERIES, CONDITIONS, FEET_SERIES, JOINT_SERIES, SAMPLED_SERIES, did_you_mean
-from .time_base import TimeBase, fit_time_base, hold_on_grid, interpolate_linear, interpolate_smooth
+from .time_base import (
+    TimeBase,
+    fit_time_base,
+    hold_on_grid,
+    interpolate_linear,
+    interpolate_nearest,
+    interpolate_smooth,
+)
 
 _EARLY = 0.02
 """Part of a control step by which a torque that a loop gives may be stamped before it, as stamps jitter."""
@@ -110,14 +117,9 @@ def with_columns(recording: Recording, columns: Sequence[int], joint_order: tupl
 
 
 def _check_conformed(recording: Recording, control_dt: float) -> None:
-    if recording.sample_offset is not None:
-        steps = recording.sample_steps[-1] + recording.sample_offset[-1]
-    else:
-        steps = recording.sample_steps[-1]
-    own_dt = recording.duration / float(steps)
-    if abs(own_dt / control_dt - 1.0) > 1e-6:
+    if abs(recording.control_dt / control_dt - 1.0) > 1e-6:
         raise ValueError(
-            f"{recording.label}: is already on a control step of {own_dt:g} s; expected a recording as "
+            f"{recording.label}: is already on a control step of {recording.control_dt:g} s; expected a recording as "
             f"loaded, or one on {control_dt:g} s. Conform the loaded recording."
         )
 
@@ -148,19 +150,26 @@ def _kept(recording: Recording, base: TimeBase) -> dict[str, Any]:
 
 def _placed(recording: Recording, base: TimeBase, control_dt: float) -> dict[str, Any]:
     """The samples as they are, each beside the nearest step of the grid; whether the drive is on by its hold."""
-    stamps, enable = recording.time - recording.time[0], recording.torque_enable
-    result: dict[str, Any] = {"time": stamps, "sample_at": base.sample_at}
-    result["sample_offset"] = stamps / control_dt - base.sample_steps
-    if enable is not None:
-        share_on = hold_on_grid(stamps, enable[:, None].astype(np.float64), control_dt, base.num_steps)
-        result["command_torque_enable"] = share_on[:, 0] >= 0.5
-    return result
+    stamps = recording.time - recording.time[0]
+    return {
+        "time": stamps,
+        "sample_at": base.sample_at,
+        "sample_offset": stamps / control_dt - base.sample_steps,
+        "command_torque_enable": _enabled(recording, base, control_dt),
+    }
+
+
+def _enabled(recording: Recording, base: TimeBase, control_dt: float) -> np.ndarray | None:
+    """Whether the drive is on for most of each control step, (steps,) bool."""
+    if recording.torque_enable is None:
+        return None
+    on = recording.torque_enable[:, None].astype(np.float64)
+    return hold_on_grid(recording.time - recording.time[0], on, control_dt, base.num_steps)[:, 0] >= 0.5
 
 
 def _resampled(recording: Recording, base: TimeBase, control_dt: float) -> dict[str, Any]:
     """The samples on the grid."""
-    stride, count = base.sample_stride, base.num_steps
-    stamps = recording.time - recording.time[0]
+    stride, stamps = base.sample_stride, recording.time - recording.time[0]
     at = np.minimum(stride * control_dt * np.arange(base.num_samples), stamps[-1])
     result: dict[str, Any] = {}
     for key, interpolate in (
@@ -170,21 +179,16 @@ def _resampled(recording: Recording, base: TimeBase, control_dt: float) -> dict[
         ("real_ee_pose", interpolate_linear),
         ("base_ang_vel", interpolate_linear),
         ("base_lin_acc", interpolate_linear),
+        *((key, interpolate_nearest) for key in ("base_quat", *FEET_SERIES)),
     ):
         if (values := getattr(recording, key)) is not None:
             result[key] = interpolate(stamps, values, at)
-    for key in ("base_quat", *FEET_SERIES):
-        if (values := getattr(recording, key)) is not None:
-            after = np.searchsorted(stamps, at).clip(1, len(stamps) - 1)
-            result[key] = values[after - (at - stamps[after - 1] < stamps[after] - at)]
     if recording.dof_effort is not None:  # it may jump: its samples keep their instants
         following = np.searchsorted(stamps, at - _EARLY * control_dt).clip(max=len(stamps) - 1)
         result["dof_effort"] = recording.dof_effort[following]
         result["effort_offset"] = np.maximum(stamps[following] - at, 0.0) / control_dt
-    if recording.torque_enable is not None:
-        share_on = hold_on_grid(stamps, recording.torque_enable[:, None].astype(np.float64), control_dt, count)
-        result["command_torque_enable"] = share_on[:, 0] >= 0.5
-        result["torque_enable"] = result["command_torque_enable"][::stride]
+    if (on := _enabled(recording, base, control_dt)) is not None:
+        result |= {"command_torque_enable": on, "torque_enable": on[::stride]}
     return result
 
 

@@ -13,7 +13,7 @@ import torch
 
 from pace_actuators.text import listed
 from pace_optim.recording import Recording, validation_start, with_columns
-from pace_optim.recording.moving_base import GRAVITY, Carried, force_noise, measured_motion, read_earlier
+from pace_optim.recording.carried import GRAVITY, Carried, force_noise, measured_motion, read_earlier
 from pace_optim.recording.noise import LEAST_NOISE, noise_floor, noise_variance
 from pace_optim.recording.time_base import interpolate_linear
 from pace_optim.recording.torque import TorqueChannel
@@ -271,6 +271,13 @@ class Torques:
         return replace(self, measured=self.measured[step, recording], known=known, after=after)
 
 
+_OVER_TIME = (
+    "command", "command_vel", "command_effort", "measured", "measured_vel", "sampled", "train", "torque_enable",
+    "ee_pose", "sample_offset", "settling",
+)  # fmt: skip
+"""What a dataset has at each control step of each recording."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Dataset:
     """R recordings of n joints, padded to the longest; T control steps.
@@ -367,30 +374,26 @@ class Dataset:
             known=values.isfinite().all(dim=2).all(dim=0),
         )
 
+    def at(self, step: Any, recording: Sequence[int] | torch.Tensor) -> Dataset:
+        """Some control steps (T', W) of some recordings (W,), by index: each becomes a recording."""
+        series = {name: value[step, recording] for name in _OVER_TIME if (value := getattr(self, name)) is not None}
+        return replace(
+            self,
+            **series,
+            recordings=tuple(self.recordings[r] for r in recording),
+            validation_only=tuple(self.validation_only[r] for r in recording),
+            session_start=self.session_start[recording],
+            start_time=self.start_time[recording],
+            start_vel=self.start_vel[recording],
+            carried=None if self.carried is None else self.carried.at(step, recording),
+            torques=None if self.torques is None else self.torques.at(step, recording),
+        )
+
     def select(self, indices: Sequence[int]) -> Dataset:
         """Some of the recordings, by index."""
         chosen = list(indices)
-        return Dataset(
-            recordings=tuple(self.recordings[r] for r in chosen),
-            command=self.command[:, chosen],
-            command_vel=None if self.command_vel is None else self.command_vel[:, chosen],
-            command_effort=None if self.command_effort is None else self.command_effort[:, chosen],
-            measured=self.measured[:, chosen],
-            measured_vel=self.measured_vel[:, chosen],
-            sampled=self.sampled[:, chosen],
-            train=self.train[:, chosen],
-            torque_enable=None if self.torque_enable is None else self.torque_enable[:, chosen],
-            ee_pose=None if self.ee_pose is None else self.ee_pose[:, chosen],
-            sample_offset=None if self.sample_offset is None else self.sample_offset[:, chosen],
-            validation_only=tuple(self.validation_only[r] for r in chosen),
-            session_start=self.session_start[chosen],
-            start_time=self.start_time[chosen],
-            start_vel=self.start_vel[chosen],
-            work=self.work,
-            settling=None if self.settling is None else self.settling[:, chosen],
-            carried=None if self.carried is None else self.carried.select(chosen),
-            torques=None if self.torques is None else self.torques.at(slice(None), chosen),
-        )
+        carried = None if self.carried is None else self.carried.select(chosen)
+        return replace(self.at(slice(None), chosen), carried=carried)
 
     def to(self, device: torch.device, dtype: torch.dtype) -> Dataset:
         """The same with all tensors on a device, numbers of a type; itself where nothing changes."""
@@ -406,15 +409,12 @@ class Dataset:
         """The same of some of the joints, by index."""
         chosen = list(joints)
         names = tuple(self.recordings[0].joint_names[j] for j in chosen)
+        of_joints = ("command", "command_vel", "command_effort", "measured", "measured_vel", "start_vel")
+        series = {name: value[..., chosen] for name in of_joints if (value := getattr(self, name)) is not None}
         return replace(
             self,
+            **series,
             recordings=tuple(with_columns(recording, chosen, names) for recording in self.recordings),
-            command=self.command[..., chosen],
-            command_vel=None if self.command_vel is None else self.command_vel[..., chosen],
-            command_effort=None if self.command_effort is None else self.command_effort[..., chosen],
-            measured=self.measured[..., chosen],
-            measured_vel=self.measured_vel[..., chosen],
-            start_vel=self.start_vel[..., chosen],
             carried=None if self.carried is None else self.carried.on_joints(chosen),
             work=None if self.work is None else self.work.on_joints(chosen),
             torques=None,

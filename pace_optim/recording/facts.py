@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
-from pace_actuators.files import parsed_json
 from pace_actuators.text import listed
 
 from .data import Drive, ImuPose, Load
@@ -32,6 +30,13 @@ def check_one_line(label: str, text: str, source: str) -> None:
         raise ValueError(f"{source}: {label} is {text!r}; expected one line of printable text. Correct it.")
 
 
+def _texts(value: Any) -> Sequence[str] | None:
+    """A list of text; ``None`` for anything else."""
+    texts = value.tolist() if isinstance(value, np.ndarray) else value
+    is_list = isinstance(texts, Sequence) and not isinstance(texts, str)
+    return texts if is_list and all(isinstance(text, str) for text in texts) else None
+
+
 def joint_names_of(value: Any, num_joints: int, source: str) -> tuple[str, ...]:
     """Return the file's joint names as a tuple, () when it has none.
 
@@ -41,8 +46,7 @@ def joint_names_of(value: Any, num_joints: int, source: str) -> tuple[str, ...]:
     """
     if value is None:
         return ()
-    names = value.tolist() if isinstance(value, np.ndarray) else value
-    if isinstance(names, str) or not isinstance(names, Sequence) or not all(isinstance(n, str) for n in names):
+    if (names := _texts(value)) is None:
         raise ValueError(
             f"{source}: joint_names is {value!r}; expected a list of text, one name per column of dof_pos. "
             "Write joint_names as a list of names."
@@ -82,9 +86,6 @@ def imu_of(value: Any, source: str) -> ImuPose:
     """Where the IMU is: a site's name, or ``{body, pos, quat}``."""
     if value is None:
         return ImuPose()
-    if isinstance(value, str) and value.lstrip().startswith("{"):  # in an .npz
-        with suppress(ValueError):
-            value = parsed_json(value)
     if isinstance(value, str):
         check_one_line("imu", value, source)
         return ImuPose(site=value)
@@ -108,9 +109,6 @@ def imu_of(value: Any, source: str) -> ImuPose:
 
 def couplings_of(value: Any, source: str) -> dict[str, dict[str, float]]:
     """Motors that move several joints, {motor: {joint: ratio}}; none where none are stated."""
-    if isinstance(value, str):  # in an .npz
-        with suppress(ValueError):  # the message below shows what is no JSON
-            value = parsed_json(value)
     rows = {} if value is None else value
     if not isinstance(rows, Mapping) or not all(isinstance(row, Mapping) and row for row in rows.values()):
         raise ValueError(
@@ -134,8 +132,7 @@ def feet_of(value: Any, count: int, source: str) -> tuple[str, ...]:
     """Names of the feet that contacts are of, () where none are given."""
     if value is None:
         return ()
-    names = value.tolist() if isinstance(value, np.ndarray) else value
-    if isinstance(names, str) or not isinstance(names, Sequence) or not all(isinstance(n, str) for n in names):
+    if (names := _texts(value)) is None:
         raise ValueError(f"{source}: feet is {value!r}; expected a list of names, one per column of contact.")
     if len(names) != count or len(set(names)) != count:
         raise ValueError(f"{source}: feet has {listed(names)}; expected {count} different names, one per column.")
@@ -190,9 +187,6 @@ def _in_column_order(
 def _added_mass(value: Any, source: str) -> dict[str, float]:
     if value is None:
         return {}
-    if isinstance(value, str):  # in an .npz
-        with suppress(ValueError):  # the message below shows what is no JSON
-            value = parsed_json(value)
     if not isinstance(value, Mapping) or not all(isinstance(body, str) for body in value):
         raise ValueError(
             f"{source}: added_mass is {value!r}; expected {{body: kg}} (in an .npz as JSON text). "
@@ -207,9 +201,6 @@ def _added_mass_at(value: Any, masses: Mapping[str, float], source: str) -> dict
     """Where added masses are, {body: (x, y, z)} [m]."""
     if value is None:
         return {}
-    if isinstance(value, str):  # in an .npz
-        with suppress(ValueError):  # the message below shows what is no JSON
-            value = parsed_json(value)
     places = {body: as_array(at) for body, at in (value if isinstance(value, Mapping) else {"": ""}).items()}
     for body, place in places.items():
         if place.dtype.kind not in "iuf" or place.shape != (3,) or not np.isfinite(place).all():

@@ -14,6 +14,7 @@ import os
 import re
 import shlex
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import fields as dataclass_fields
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +24,6 @@ import numpy as np
 import torch
 
 from pace_actuators.files import file_at, parsed_json, read_tensors, write_atomically, writing
-from pace_actuators.memory import check_memory
 from pace_actuators.text import listed
 from pace_optim.terminal.arrays import read_arrays
 
@@ -42,6 +42,7 @@ from .keys import (
     as_fact,
     did_you_mean,
 )
+from .text_table import Rows, are_numbers, column_of, read_rows
 
 SUFFIXES = (".pt", ".npz", ".csv")
 
@@ -71,17 +72,12 @@ def load_recording(
         fields, found = read_csv(path)
     else:
         fields = _read_pt(path) if suffix == ".pt" else _read_npz(path)
-    fields = with_shared_facts(add_json_facts(fields, path), facts or {})
+    beside, notes = facts_beside(path)
+    fields = with_shared_facts(with_facts(fields, beside, path), facts or {})
     if rate and "time" not in fields and "dof_pos" in fields:
         fields["time"] = np.arange(len(as_array(fields["dof_pos"]))) / rate
     recording = check_recording(fields, source=str(path), default_name=path.stem, found=found)
-    return replace(recording, notes=(*recording.notes, *facts_notes(path)))
-
-
-def facts_notes(path: Path) -> list[str]:
-    """What is to be said of the JSON file of facts beside a recording."""
-    beside = path.with_suffix(".json")
-    return [note] if beside.is_file() and (note := read_facts(beside)[1]) else []
+    return replace(recording, notes=(*recording.notes, *notes))
 
 
 def stated_couplings(paths: Sequence[str | os.PathLike[str]]) -> dict[str, dict[str, float]]:
@@ -90,7 +86,7 @@ def stated_couplings(paths: Sequence[str | os.PathLike[str]]) -> dict[str, dict[
     first = ""
     for path in map(Path, paths):
         read = {".npz": _read_npz, ".pt": _read_pt}.get(path.suffix.lower()) if path.is_file() else None
-        value = add_json_facts({}, path).get("couplings")
+        value = facts_beside(path)[0].get("couplings")
         if value is None and read is not None:
             value = read(path).get("couplings")
         own = couplings_of(value, str(path))
@@ -209,27 +205,41 @@ def _without_tensor(value: Any) -> Any:
         return {key: _without_tensor(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [_without_tensor(item) for item in value]
-    return value
+    return _dict_of(value) if isinstance(value, str) else value
+
+
+def _dict_of(text: str) -> Any:
+    """A dict that a file holds as JSON text; other text as it is."""
+    if text.lstrip().startswith("{"):
+        with suppress(ValueError, RecursionError):  # the checks of facts show what is no JSON
+            return parsed_json(text)
+    return text
 
 
 def _read_npz(path: Path) -> dict[str, Any]:
     cure = "Save arrays with numpy.savez, text as unicode arrays and dicts as JSON text."
     fields = read_arrays(path, cure)
     return {
-        key: array.item() if array.dtype.kind == "U" and array.ndim == 0 else array for key, array in fields.items()
+        key: _dict_of(array.item()) if array.dtype.kind == "U" and array.ndim == 0 else array
+        for key, array in fields.items()
     }
 
 
-def add_json_facts(fields: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Return the fields with those of the JSON file of the same stem, where there is one."""
-    facts_path = path.with_suffix(".json")
-    if not facts_path.is_file():
-        return fields
-    facts, _ = read_facts(facts_path, f", or move it away from {path.name}")
+def facts_beside(path: Path) -> tuple[dict[str, Any], list[str]]:
+    """The JSON file of facts of the same stem, none where it is not there, and what is to be said of it."""
+    beside = path.with_suffix(".json")
+    if not beside.is_file():
+        return {}, []
+    facts, note = read_facts(beside, f", or move it away from {path.name}")
+    return facts, [note] if note else []
+
+
+def with_facts(fields: dict[str, Any], facts: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    """The fields with the facts of the JSON file beside them, which may not differ."""
     for key, value in facts.items():
         if key in fields and not _same(fields[key], value):
             raise ValueError(
-                f"{facts_path}: {key} differs from the one in {path.name}"
+                f"{path.with_suffix('.json')}: {key} differs from the one in {path.name}"
                 f"{' (joint names of its columns)' if key == 'joint_names' else ''}. Keep it in one place."
             )
     return {**fields, **facts}
@@ -310,26 +320,25 @@ _LARGEST_FACTS = 1 << 20
 
 def _same(one: Any, other: Any) -> bool:
     """Whether a fact of the file and one of the JSON say the same."""
-    if isinstance(one, str) and isinstance(other, dict):
-        one = json.loads(one)
     if isinstance(one, dict) or isinstance(other, dict):
         return one == other
     return np.array_equal(as_array(one), as_array(other))
 
 
-Rows = list[list[str]] | np.ndarray
-"""Cells as text, or all of them as numbers."""
 _DATE = re.compile(r"\d{4}-\d{2}-\d{2}")
-_WHOLE = re.compile(r"\d{13,19}$")
-_LONGEST_LINE = 1 << 20
-_BYTES_PER_BYTE = 12
-"""Memory of a file's cells as text, for each of its bytes."""
-_WORDS = {"true": 1.0, "false": 0.0}
 
 
 def read_csv(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Return the fields of a CSV file, and its columns as they are called there."""
-    header, rows = _read_numbers(path) or _read_cells(path)
+    head, rows = read_rows(path)
+    header = list(head.names)
+    if not header:
+        raise ValueError(f"{path}: is empty; expected a line of column names, then one line per sample.")
+    if len(header) == 1 or head.delimiter != ",":
+        raise ValueError(
+            f"{path}: has one column, '{head.delimiter.join(header)[:60]}'; expected time, dof_pos/<joint>, "
+            "des_dof_pos/<joint>. Separate the columns by commas."
+        )
     if repeated := sorted({c for c in header if header.count(c) > 1}):
         raise ValueError(f"{path}: the column(s) {listed(repeated)} appear twice. Keep one of each.")
     columns: dict[str, dict[str, int]] = {}
@@ -337,23 +346,21 @@ def read_csv(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
         series, _, joint = column.partition("/")
         columns.setdefault(series, {})[joint] = index
     joints = list(columns.get("dof_pos", {}))
+    named = {**BASE_COLUMNS, "real_ee_pose": POSE_COLUMNS[: len(columns.get("real_ee_pose", {}))]}
     fields: dict[str, Any] = {}
     two_clocks = "des_time" in columns
     for series, index_of in columns.items():
         clock = "des_time" if two_clocks and series in ("des_time", *COMMAND_SERIES) else "time"
         own = rows[: _length(rows, list(columns.get(clock, {}).values()))] if two_clocks else rows
         if series in ("time", "des_time"):
-            fields[series] = _stamps(path, series, own, next(iter(index_of.values())))
+            fields[series] = _numbers(path, series, own, next(iter(index_of.values())), may_be_dates=True)
         elif series == "torque_enable":
             indices = list(index_of.values())
             values = np.stack([_numbers(path, header[i], own, i) for i in indices], axis=1)
             fields[series] = values[:, 0] if len(indices) == 1 else values
-        elif series == "real_ee_pose" and set(index_of) in (set(POSE_COLUMNS[:3]), set(POSE_COLUMNS)):
-            names = POSE_COLUMNS[: len(index_of)]
-            fields[series] = np.stack([_numbers(path, f"{series}/{c}", own, index_of[c]) for c in names], axis=1)
-        elif series in BASE_COLUMNS and set(index_of) == set(BASE_COLUMNS[series]):
-            names = BASE_COLUMNS[series]
-            fields[series] = np.stack([_numbers(path, f"{series}/{c}", own, index_of[c]) for c in names], axis=1)
+        elif series in named and set(index_of) == set(named[series]):
+            parts = [_numbers(path, f"{series}/{part}", own, index_of[part]) for part in named[series]]
+            fields[series] = np.stack(parts, axis=1)
         elif series in FEET_SERIES and "" not in index_of:
             fields |= _of_feet(path, series, index_of, own, fields.get("feet"))
         elif series in JOINT_SERIES and joints:
@@ -418,48 +425,6 @@ def write_csv(
     text.detach()
 
 
-def _read_numbers(path: Path) -> tuple[list[str], np.ndarray] | None:
-    """Column names and all cells, (rows, columns), where every cell is a number; else ``None``.
-
-    It is read many times faster so than cell by cell, and takes as much memory as its numbers.
-    """
-    check_memory(2 * path.stat().st_size, f"{path}: reading it", "Cut it into parts.")
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            header = [column.strip() for column in next(csv.reader([file.readline(_LONGEST_LINE)]), [])]
-            first = file.readline(_LONGEST_LINE).split(",")
-            if len(header) < 2 or any(_WHOLE.match(cell.strip()) for cell in first):  # stamps that floats would round
-                return None
-            rest = np.loadtxt(itertools.chain([",".join(first)], file), delimiter=",", comments=None, ndmin=2)
-    except (ValueError, csv.Error):  # refused below, with the place
-        return None
-    return (header, rest) if rest.shape[1] == len(header) else None
-
-
-def _read_cells(path: Path) -> tuple[list[str], list[list[str]]]:
-    check_memory(_BYTES_PER_BYTE * path.stat().st_size, f"{path}: reading it", "Leave no cell empty, or cut it.")
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = [row for row in csv.reader(file) if row]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{path}: cannot be read as CSV text ({error}). Save it as comma-separated UTF-8.") from error
-    if not rows:
-        raise ValueError(f"{path}: is empty; expected a line of column names, then one line per sample.")
-    header = [column.strip() for column in rows[0]]
-    if len(header) == 1:
-        raise ValueError(
-            f"{path}: has one column, '{header[0][:60]}'; expected time, dof_pos/<joint>, "
-            "des_dof_pos/<joint>. Separate the columns by commas."
-        )
-    for line, row in enumerate(rows[1:], start=2):
-        if len(row) != len(header):
-            raise ValueError(
-                f"{path}: row {line} has {len(row)} cells but the header has {len(header)}. "
-                "Complete or delete the row (the last one is often cut short)."
-            )
-    return header, rows[1:]
-
-
 def _check_joints(path: Path, series: str, found: list[str], joints: list[str], header: list[str]) -> None:
     if "" in found:
         raise ValueError(
@@ -483,31 +448,16 @@ def _length(rows: Rows, indices: list[int]) -> int:
     return count
 
 
-def _stamps(path: Path, column: str, rows: Rows, index: int) -> np.ndarray:
-    """Stamps as numbers, whole numbers exactly; as text where they are dates."""
-    if isinstance(rows, np.ndarray):
-        return rows[:, index]
-    cells = [row[index].strip() for row in rows]
-    if cells and (_DATE.match(cells[0]) or _WHOLE.match(cells[0])):
-        try:
-            return np.array(cells) if _DATE.match(cells[0]) else np.array([int(cell) for cell in cells])
-        except (ValueError, OverflowError):  # refused below
-            pass
-    return _numbers(path, column, rows, index)
-
-
-def _numbers(path: Path, column: str, rows: Rows, index: int) -> np.ndarray:
-    if isinstance(rows, np.ndarray):
-        return np.ascontiguousarray(rows[:, index])
-    words = _WORDS if column.startswith("torque_enable") else {}
-    values = np.empty(len(rows))
-    for row, cells in enumerate(rows):
-        cell = cells[index].strip()
-        try:
-            values[row] = words[cell.lower()] if cell.lower() in words else float(cell)
-        except ValueError:
-            raise ValueError(
-                f"{path}: row {row + 2}, column '{column}' holds '{cell}'; expected a number. "
-                "Correct the cell, or delete the row."
-            ) from None
+def _numbers(path: Path, column: str, rows: Rows, index: int, may_be_dates: bool = False) -> np.ndarray:
+    """A column's numbers, whole ones exactly; a cell that holds none is refused with its place."""
+    values = column_of(rows, index)
+    if may_be_dates and values.dtype.kind == "U" and _DATE.match(values[0]):
+        return values
+    if values.dtype.kind == "U" or np.isnan(values).any():
+        for line, row in enumerate(rows, start=2):
+            if not are_numbers([str(row[index])]):
+                raise ValueError(
+                    f"{path}: row {line}, column '{column}' holds '{row[index]}'; expected a number. "
+                    "Correct the cell, or delete the row."
+                )
     return values

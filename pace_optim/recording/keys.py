@@ -15,18 +15,13 @@ CONDITIONS = ("temperature", "voltage")
 JOINT_SERIES = ("dof_pos", "des_dof_pos", "des_dof_vel", "des_dof_effort", "dof_vel", "dof_effort", *CONDITIONS)
 POSE_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 """Columns of `real_ee_pose`: a position [m], or a position and a quaternion."""
-BASE_SERIES = ("base_ang_vel", "base_lin_acc", "base_quat")
-"""What an IMU shows of a base that moves, and its orientation."""
 BASE_COLUMNS = {"base_ang_vel": ("x", "y", "z"), "base_lin_acc": ("x", "y", "z"), "base_quat": ("w", "x", "y", "z")}
-"""Columns of these."""
+"""What an IMU shows of a base that moves, and its orientation: the columns of each."""
 FEET_SERIES = ("contact", "foot_force")
 """What feet feel of the ground."""
-SAMPLED_SERIES = (*MEASURED_SERIES, *CONDITIONS, "torque_enable", "real_ee_pose", *BASE_SERIES, *FEET_SERIES)
+SAMPLED_SERIES = (*MEASURED_SERIES, *CONDITIONS, "torque_enable", "real_ee_pose", *BASE_COLUMNS, *FEET_SERIES)
 """Series with a value at each sample."""
-SERIES = ("time", *JOINT_SERIES, "torque_enable", "real_ee_pose", "des_time", *BASE_SERIES, *FEET_SERIES)
-UNITS = {"dof_pos": "rad", "dof_vel": "rad/s", "dof_effort": "N m"}
-UNITS |= {f"des_{key}": unit for key, unit in UNITS.items()} | {"temperature": "°C", "voltage": "V"}
-"""Unit of each series of joints."""
+SERIES = ("time", *JOINT_SERIES, "torque_enable", "real_ee_pose", "des_time", *BASE_COLUMNS, *FEET_SERIES)
 DRIVE_FACTS = DRIVE_FIELDS
 BENCH_FACTS = ("load_mass", "load_length", "arm_mass")
 LOAD_FACTS = ("added_mass", "added_mass_at", *BENCH_FACTS)

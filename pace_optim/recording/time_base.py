@@ -158,6 +158,17 @@ def interpolate_linear(time: np.ndarray, values: np.ndarray, at: np.ndarray) -> 
     return np.stack([np.interp(at, time, column) for column in values.T], axis=1)
 
 
+def interpolate_nearest(time: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Values (T, …) of the samples that are nearest to some instants."""
+    after = np.searchsorted(time, at).clip(1, len(time) - 1)
+    return values[after - (at - time[after - 1] < time[after] - at)]
+
+
+def held(time: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Values (T, …) in force at some instants; before the first, the first."""
+    return values[np.clip(np.searchsorted(time, at, side="right") - 1, 0, None)]
+
+
 def hold_on_grid(time: np.ndarray, values: np.ndarray, step: float, count: int) -> np.ndarray:
     """Return the zero-order hold of `values`, averaged over each of `count` steps of a grid that starts at 0.
 

@@ -68,33 +68,16 @@ class Windows:
 
     def cut(self, dataset: Dataset) -> Dataset:
         """The dataset of windows, each a recording."""
-        at, since = self._at(dataset.command), self.step[0] * self.control_dt
-        recording = self.recording.tolist()
+        since = self.step[0] * self.control_dt
+        begins = zip(self.recording.tolist(), self.step[0].tolist(), strict=True)
         return replace(
-            dataset,
-            recordings=tuple(dataset.recordings[r] for r in recording),
-            command=dataset.command[at],
-            command_vel=None if dataset.command_vel is None else dataset.command_vel[at],
-            command_effort=None if dataset.command_effort is None else dataset.command_effort[at],
-            measured=dataset.measured[at],
-            measured_vel=dataset.measured_vel[at],
+            dataset.at(*self._at(dataset.command)),
             sampled=self.mask(dataset.sampled),
             train=self.mask(dataset.train),
             settling=None if dataset.settling is None else self.mask(dataset.settling),
-            torque_enable=None if dataset.torque_enable is None else dataset.torque_enable[at],
-            ee_pose=None if dataset.ee_pose is None else dataset.ee_pose[at],
-            sample_offset=None if dataset.sample_offset is None else dataset.sample_offset[at],
-            validation_only=tuple(dataset.validation_only[r] for r in recording),
-            start_vel=torch.stack(
-                [
-                    _speed(dataset, r, step, self.control_dt)
-                    for r, step in zip(recording, self.step[0].tolist(), strict=True)
-                ]
-            ),
+            start_vel=torch.stack([_speed(dataset, r, step, self.control_dt) for r, step in begins]),
             start_time=dataset.start_time[self.recording] + since,
             session_start=dataset.session_start[self.recording] + since,
-            carried=None if dataset.carried is None else dataset.carried.at(*self._at(dataset.command)),
-            torques=None if dataset.torques is None else dataset.torques.at(*self._at(dataset.command)),
         )
 
     def _at(self, values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -177,28 +177,30 @@ class Run:
             if data or str(self.folder) in str(error):
                 raise
             raise ValueError(f"{error} (Of the run's own settings: {self.folder / 'settings.json'}.)") from None
-        path = self.folder / "result.json"
-        if path.is_file():
-            result = FitResult.load(path)
+        if result := self.result:
             problem = problem.with_torque_noise(result.torque_noise).with_imu_delays(result.imu_delays)
         if data:  # other recordings have other bounds; the run's values must be within
             problem = problem.reaching(read_bounds(self.folder))
         return problem if effects is None else problem.with_effects(effects)
 
     @property
+    def result(self) -> FitResult | None:
+        """What it has found so far; ``None``: it has not ended."""
+        path = self.folder / "result.json"
+        return FitResult.load(path) if path.is_file() else None
+
+    @property
     def told_drive_dt(self) -> float | None:
         """Period of the drives' loops [s] that its recordings showed where none was stated; ``None``: as assumed."""
-        path = self.folder / "result.json"
-        rate = FitResult.load(path).loop_rate if path.is_file() else {}
+        rate = result.loop_rate if (result := self.result) else {}
         return rate["used_s"] if rate and rate["used_s"] != rate["assumed_s"] else None
 
     @property
     def used_physics_dt(self) -> float | None:
         """Physics step of its result [s], which may be finer than the robot's; ``None``: the robot's."""
-        path = self.folder / "result.json"
-        if self.settings.physics_dt is not None or self.overridden or not path.is_file():
+        if self.settings.physics_dt is not None or self.overridden or (result := self.result) is None:
             return self.settings.physics_dt
-        return FitResult.load(path).physics_dt
+        return result.physics_dt
 
     def load_cfg(self) -> Any:
         """A fresh configuration of its environment."""

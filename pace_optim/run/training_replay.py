@@ -109,7 +109,7 @@ def replay_in_training(run: str | Path, cfg: ManagerBasedEnvCfg | None = None) -
         cfg = copy.deepcopy(fitted_cfg)
         set_physics_dt(cfg, result.physics_dt, "the fit's physics step")
     env_cfg = _held_robot(fitted_cfg, cfg, folder)
-    control_dt = _control_dt(env_cfg)
+    control_dt = env_cfg.sim.dt * env_cfg.decimation
     env = ManagerBasedRLEnv(_with_envs(env_cfg, 1))
     paths = settings.data or [str(fitted_cfg.sim2real.recording)]
     logs = read_logs(
@@ -180,10 +180,6 @@ def _with_recorded_gains(drive: Any, fitted: PaceSim2realEnvCfg) -> Any:
     """A training drive with the gains and limits of the identification task, for results that do not say them."""
     groups = [each for each in fitted.scene.robot.actuators.values() if each.joint_names_expr == drive.joint_names_expr]
     return replace(drive, **{name: getattr(groups[0], name) for name in DRIVE_FIELDS}) if groups else drive
-
-
-def _control_dt(cfg: PaceSim2realEnvCfg) -> float:
-    return cfg.sim.dt * cfg.decimation
 
 
 def _with_envs(cfg: PaceSim2realEnvCfg, num_envs: int) -> PaceSim2realEnvCfg:

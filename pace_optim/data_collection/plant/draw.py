@@ -27,6 +27,7 @@ _NOT_IN_BACKGROUND = {
     "command_acceleration_limit",
     "backlash",
 }
+_BACKGROUND = 20  # effects of a background, at most
 _STIFFEST = 1e5  # [N m/rad], of a small elasticity
 _BENCH_BASE = {
     "armature": Draw(unit="kg m^2", low=0.05, high=0.2),
@@ -181,7 +182,6 @@ def with_background(
     rng: np.random.Generator,
     *,
     size: float,
-    count: int = 20,
     cfg: PlantCfg | None = None,
 ) -> Drawn:
     """Add small amounts of other library effects that together change the motion by ``size`` [rad], RMS.
@@ -190,11 +190,10 @@ def with_background(
 
     Args:
         size: RMS change of the motion by all of them together [rad].
-        count: How many, at most.
     """
     cfg = cfg or PlantCfg()
     others = [n for n in library_effects() if n not in drawn.truth.effects and n not in _NOT_IN_BACKGROUND]
-    names = sorted(rng.permutation(others)[:count].tolist())
+    names = sorted(rng.permutation(others)[:_BACKGROUND].tolist())
     values = {name: draw_effect(name, robot, rng) for name in names}
     scale, made, change = 0.05 * size / max(drawn.size, size), list(drawn.recordings), 0.0
     truth = drawn.truth

@@ -1,4 +1,4 @@
-"""One integration step of all recordings."""
+"""One integration step of all recordings, with exact Coulomb friction: impulses within their bounds, or no motion."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .friction_solver import friction_impulse
 from .hidden import HiddenEffect
 from .rigid_body import RigidBody
 from .state import Drives, State
+
+_SWEEPS = 40
+_TOLERANCE = 1e-9  # of a sweep's largest change of speed [rad/s]
 
 
 class Dynamics:
@@ -195,6 +197,50 @@ class Dynamics:
                 self.motor_pos = np.where(self.given, link + twist, position)
             if self._mount_k is not None:
                 self.q[:, self.n :] = -bias[:, self.n :] / self._mount_k
+
+
+def friction_impulse(
+    v: np.ndarray, A: np.ndarray, lower: np.ndarray, upper: np.ndarray, blocks: np.ndarray, start: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Speeds after friction, and its impulses.
+
+    Per joint the set-valued law: impulse λ in [lower, upper], v > 0 only at the lower, v < 0 only at the upper bound,
+    where v = v_free + A λ. One joint has the closed form λ = clip(-v / A); several that are coupled are swept over
+    (projected Gauss-Seidel), all kinematic trees at once.
+
+    Args:
+        v: Speeds without friction, (R, N) [rad/s].
+        A: Inverse of the inertia, (R, K, B, B) for K trees of B coordinates [1/(kg m^2)].
+        lower: Smallest impulse, (R, N) [N m s]; 0 for a coordinate without friction.
+        upper: Largest impulse, (R, N) [N m s].
+        blocks: Coordinates of each tree, (K, B).
+        start: Impulses to start from, (R, N) [N m s].
+
+    Returns:
+        Speeds and impulses, each (R, N).
+    """
+    if blocks.size == 1:
+        impulse = np.minimum(np.maximum(-v / A[:, 0, 0], lower), upper)
+        return v + A[:, 0, 0] * impulse, impulse
+    w = v[:, blocks]
+    low, high = lower[:, blocks], upper[:, blocks]
+    impulse = np.minimum(np.maximum(start[:, blocks], low), high)
+    w = w + np.matmul(A, impulse[..., None])[..., 0]
+    size = blocks.shape[1]
+    diagonal = A[..., np.arange(size), np.arange(size)]
+    for _ in range(_SWEEPS):
+        largest = 0.0
+        for j in range(size):
+            new = np.minimum(np.maximum(impulse[..., j] - w[..., j] / diagonal[..., j], low[..., j]), high[..., j])
+            change = new - impulse[..., j]
+            impulse[..., j] = new
+            w += A[..., j] * change[..., None]
+            largest = max(largest, float(np.abs(change * diagonal[..., j]).max()))
+        if largest < _TOLERANCE:
+            break
+    result, impulses = np.empty_like(v), np.empty_like(v)
+    result[:, blocks], impulses[:, blocks] = w, impulse
+    return result, impulses
 
 
 def _apply(A: np.ndarray, force: np.ndarray, blocks: np.ndarray) -> np.ndarray:

@@ -135,7 +135,7 @@ class RigidBody:
         for row, load in enumerate(loads):
             bench = {key: value for key in _BENCH_DEFAULTS if (value := getattr(load, key)) is not None}
             if bench:
-                _write_bench_load(model, names, {**_BENCH_DEFAULTS, **bench}, row, mass, inertia, ipos, pos)
+                _write_bench_load(names, {**_BENCH_DEFAULTS, **bench}, row, mass, inertia, ipos, pos)
             unturned = {
                 body: _in_parent(pos[row, body], quat[row, body], ipos[row, body]) for body in range(model.nbody)
             }
@@ -182,7 +182,7 @@ def _welded(model: mujoco.MjModel, body: int) -> list[int]:
     return [i for i in range(model.nbody) if model.body_weldid[i] == body]
 
 
-def _write_bench_load(model, names, load, row, mass, inertia, ipos, pos) -> None:  # type: ignore[no-untyped-def]
+def _write_bench_load(names, load, row, mass, inertia, ipos, pos) -> None:  # type: ignore[no-untyped-def]
     """The bench's point mass on a uniform rod: m at l, rod m_a with m_a l^2 / 12 about its middle."""
     if not {"arm", "load"} <= set(names):
         raise ValueError(

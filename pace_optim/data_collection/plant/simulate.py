@@ -13,14 +13,12 @@ from pace_optim.recording import Drive, Recording
 from .dynamics import Dynamics, _overriders
 from .hidden import HiddenEffect, effect_named
 from .rigid_body import ModelChange, RigidBody
-from .robot import DRIVE_FIELDS, PlantRobot, plant_robot
+from .robot import DRIVE_FIELDS, PlantRobot
 from .state import Drives
 from .truth import PlantCfg, Run, Truth, per_joint
 
 
-def simulate_runs(
-    task: str | PlantRobot, runs: Sequence[Run], truth: Truth, cfg: PlantCfg | None = None
-) -> list[Recording]:
+def simulate_runs(robot: PlantRobot, runs: Sequence[Run], truth: Truth, cfg: PlantCfg | None = None) -> list[Recording]:
     """Make recordings of a robot with hidden effects, all side by side.
 
     At every control instant the encoder is read, that instant's target is issued, the controller computes, and its
@@ -31,14 +29,14 @@ def simulate_runs(
         runs: Commands, gains and loads of each recording; commands of the same length.
         cfg: How the plant is stepped and measured.
     """
-    return simulate_truths(task, runs, [truth], cfg)[0]
+    return simulate_truths(robot, runs, [truth], cfg)[0]
 
 
 def simulate_truths(
-    task: str | PlantRobot, runs: Sequence[Run], truths: Sequence[Truth], cfg: PlantCfg | None = None
+    robot: PlantRobot, runs: Sequence[Run], truths: Sequence[Truth], cfg: PlantCfg | None = None
 ) -> list[list[Recording]]:
     """The same for several truths with the same effects, delay mode and noise; indexed by truth, then by run."""
-    return [[motion.recording for motion in motions] for motions in simulate_motions(task, runs, truths, cfg)]
+    return [[motion.recording for motion in motions] for motions in simulate_motions(robot, runs, truths, cfg)]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -54,11 +52,10 @@ class Motion:
 
 
 def simulate_motions(
-    task: str | PlantRobot, runs: Sequence[Run], truths: Sequence[Truth], cfg: PlantCfg | None = None
+    robot: PlantRobot, runs: Sequence[Run], truths: Sequence[Truth], cfg: PlantCfg | None = None
 ) -> list[list[Motion]]:
     """The same with positions and torques, indexed by truth, then by run."""
     cfg = cfg or PlantCfg()
-    robot = plant_robot(task) if isinstance(task, str) else task
     _check(robot, runs, truths)
     logged, seen, torque, drives = _Session(robot, runs, truths, cfg).run()
     time = np.arange(len(runs[0].command)) * cfg.control_dt

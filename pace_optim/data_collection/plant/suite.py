@@ -45,26 +45,21 @@ def make_suite(
     *,
     seed: int = 0,
     duration: float | None = None,
-    known_mass: dict[str, float] | None = None,
-    load: Load | None = None,
     gains: tuple[float, float] | None = None,
 ) -> Suite:
     """The usual recordings of a robot.
 
     "battery": the six motions of 10 s, one chirp again with 1.5 times the proportional gain, one again with a known
-    mass added; validated by a multisine and by other steps. "chirp": 20 s, validated by a multisine. Recordings follow
-    one another without a pause, in this order.
+    mass added (0.8 kg on the bench, 0.5 kg on each last link elsewhere); validated by a multisine and by other steps.
+    "chirp": 20 s, validated by a multisine. Recordings follow one another without a pause, in this order.
 
     Args:
         duration: Of each recording [s]; None for the usual.
-        known_mass: What is added for one recording, {body: kg}; None for the robot's usual (0.8 kg on the bench,
-            0.5 kg on each last link elsewhere).
         gains: kp [N m/rad] and kd [N m s/rad] of all joints; None for the robot's.
-        load: What all recordings carry; None for the robot's usual (the bench's pendulum of 0.30 kg m^2, 8 N m).
     """
     bench = robot.name == "test_bench"
-    load = load or (BENCH_LOAD if bench else Load())
-    known_mass = known_mass or (_BENCH_MASS if bench else _last_links(robot))
+    load = BENCH_LOAD if bench else Load()
+    known_mass = _BENCH_MASS if bench else _last_links(robot)
     small = 0.6 if bench else 0.75
     drive, stiffness = Drive(), robot.drive["stiffness"]
     if gains is not None:

@@ -26,7 +26,7 @@ from pace_actuators.identified import DRIVE_FIELDS
 from pace_optim.problem.inverse_dynamics import LinkMotion, bounded_least_squares, frame_motion, model_of
 from pace_optim.problem.moving_base import joints_of_feet
 from pace_optim.problem.problem import Problem
-from pace_optim.recording.moving_base import standing_feet
+from pace_optim.recording.carried import standing_feet
 
 _SMOOTHING = 0.01
 """Standard deviation of the smoothing [s]; of slow recordings 1.5 samples."""

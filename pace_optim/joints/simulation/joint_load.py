@@ -15,7 +15,7 @@ from pace_envs import ManagerBasedEnv
 from pace_envs.closed_loops import ClosedLoops
 from pace_envs.motor_coordinates import MotorCoordinates
 from pace_envs.moving_frame import FrameState, bias_in_frame, motion_of_bodies
-from pace_optim.recording.moving_base import Carried
+from pace_optim.recording.carried import Carried
 
 Parameter = tuple[str, str]
 """An effect on the model, and one of its parameters."""

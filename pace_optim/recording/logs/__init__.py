@@ -1,10 +1,10 @@
 """Logs of other programs as recordings: rosbag2, ROS 1 bags, LeRobot datasets, parquet, and CSV with any names.
 
->>> for recording in load_recordings("leg_mcap", Robot(joint_names=("hip", "knee"))): ...
+>>> LogReader(["leg_mcap"]).recordings("leg_mcap", Robot(joint_names=("hip", "knee")))
 """
 
 from .column_map import ColumnMap, read_map, with_rate, write_map
-from .load import LogReader, Robot, column_names, is_log, load_recordings, paired_files, understood
+from .load import LogReader, Robot, column_names, is_log, paired_files
 
 __all__ = [
     "ColumnMap",
@@ -12,10 +12,8 @@ __all__ = [
     "Robot",
     "column_names",
     "is_log",
-    "load_recordings",
     "paired_files",
     "read_map",
-    "understood",
     "with_rate",
     "write_map",
 ]

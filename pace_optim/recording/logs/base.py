@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,8 +12,9 @@ import numpy as np
 
 from pace_actuators.text import listed
 from pace_optim.recording.keys import BASE_COLUMNS
+from pace_optim.recording.time_base import interpolate_nearest
 
-from .log import Channel, Log
+from .log import Log
 
 BASE_UNITS = {
     "base_ang_vel": {"rad/s": 1.0, "deg/s": np.pi / 180, "mrad/s": 1e-3},
@@ -68,7 +70,7 @@ def guess_base(log: Log) -> tuple[BaseMap, list[str]]:
     found: dict[str, dict[str, dict[str, str]]] = {}
     for key, channel in log.channels.items():
         axis = _AXIS.search(key)
-        series = next((name for name, word in _WORDS.items() if word.search(_own(key, channel))), "")
+        series = next((name for name, word in _WORDS.items() if word.search(channel.name)), "")
         if axis is None or not series or channel.series:
             continue
         letter = (axis[1] or axis[2]).lower()
@@ -87,16 +89,11 @@ def guess_base(log: Log) -> tuple[BaseMap, list[str]]:
     return BaseMap(series=whole, contact=contact, foot_force={}), [f"The base moves: {', '.join(said)}."]
 
 
-def _own(key: str, channel: Channel) -> str:
-    return key.removeprefix(channel.table + ":") if channel.table else key
-
-
 def _contacts(log: Log) -> dict[str, str]:
     result: dict[str, str] = {}
     for key, channel in log.channels.items():
-        name = _own(key, channel)
-        if _CONTACT.search(name) and np.isin(channel.values, (0, 1)).all() and not channel.series:
-            foot = _CONTACT.sub("", name).strip("_. /[]")
+        if _CONTACT.search(channel.name) and np.isin(channel.values, (0, 1)).all() and not channel.series:
+            foot = _CONTACT.sub("", channel.name).strip("_. /[]")
             if foot and not foot.isdigit():
                 result.setdefault(foot, key)
     return result
@@ -124,16 +121,10 @@ def base_fields(log: Log, base: BaseMap, time: np.ndarray) -> dict[str, Any]:
 
 
 def _at(log: Log, name: str, time: np.ndarray, straight: bool) -> np.ndarray:
-    if (channel := log.channels.get(name)) is None:
-        raise ValueError(
-            f"{log.name}: the column map names '{name}', which the log has not. It has: {listed(log.channels)}. "
-            "Correct the map."
-        )
+    channel = log.channel(name)
     if straight:
         return np.interp(time, channel.time, channel.values)
-    after = np.searchsorted(channel.time, time).clip(1, len(channel.time) - 1)
-    nearest = after - (time - channel.time[after - 1] < channel.time[after] - time)
-    return channel.values[nearest]
+    return interpolate_nearest(channel.time, channel.values, time)
 
 
 def read_base(content: Mapping[str, Any], path: str) -> BaseMap:
@@ -174,16 +165,12 @@ def base_text(base: BaseMap) -> list[str]:
     if base.series:
         lines += ["", "[base]", *(f"{key} = {_entry(each)}" for key, each in base.series.items())]
     if base.contact:
-        lines += ["", "[contact]", *(f"{_quoted(foot)} = {_quoted(name)}" for foot, name in base.contact.items())]
+        lines += ["", "[contact]", *(f"{json.dumps(foot)} = {json.dumps(name)}" for foot, name in base.contact.items())]
     if base.foot_force:
-        lines += ["", "[foot_force]", *(f"{_quoted(foot)} = {_entry(each)}" for foot, each in base.foot_force.items())]
+        lines += ["", "[foot_force]", *(f"{json.dumps(foot)} = {_entry(each)}" for foot, each in base.foot_force.items())]
     return lines
 
 
 def _entry(channels: Channels) -> str:
-    names = ", ".join(_quoted(name) for name in channels.names)
-    return f"{{from = [{names}]{f', unit = {_quoted(channels.unit)}' if channels.unit else ''}}}"
-
-
-def _quoted(text: str) -> str:
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    names = ", ".join(json.dumps(name) for name in channels.names)
+    return f"{{from = [{names}]{f', unit = {json.dumps(channels.unit)}' if channels.unit else ''}}}"

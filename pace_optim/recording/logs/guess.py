@@ -14,6 +14,7 @@ from scipy.optimize import linear_sum_assignment
 from pace_actuators.joint_units import JointType
 from pace_actuators.text import listed
 from pace_optim.recording.keys import COMMAND_SERIES, CONDITIONS, JOINT_SERIES, MEASURED_SERIES
+from pace_optim.recording.time_base import held
 
 from .base import guess_base
 from .column_map import ColumnMap, Source
@@ -92,7 +93,7 @@ def guess_map(log: Log, robot: Robot, channels: Mapping[str, Channel] | None = N
         channels: What units are read from, by key: those of all logs with the same columns (:func:`as_one`).
     """
     notes: list[str] = []
-    places = joint_places((_own_key(channel) for channel in log.channels.values()), robot.joint_names)
+    places = joint_places((channel.name for channel in log.channels.values()), robot.joint_names)
     candidates = [found for channel in log.channels.values() if (found := _candidate(channel, places)) is not None]
     if robot.joint_names:  # feet may have commands too
         candidates = [c for c in candidates if not is_other(c.label) or _meant(c.label, robot.joint_names, robot.wanted)]
@@ -186,19 +187,13 @@ def _order(entry: tuple[str, object]) -> int:
     return (*JOINT_SERIES, *GAINS.values()).index(entry[0])
 
 
-def _own_key(channel: Channel) -> str:
-    """Its name without the topic's or file's."""
-    return channel.key.removeprefix(channel.table + ":") if channel.table else channel.key
-
-
 def _candidate(channel: Channel, places: Mapping[str, tuple[int, int]]) -> _Candidate | None:
     if channel.series:
         told = meaning("x", channel.table).commanded and not channel.series.startswith("des_")
         return _Candidate(
             channel=channel, series=("des_" if told else "") + channel.series, label=channel.joint, unit=""
         )
-    name = _own_key(channel)
-    said = meaning(name, channel.table, places.get(name))
+    said = meaning(channel.name, channel.table, places.get(channel.name))
     if not said.quantity:
         return None
     label = "_".join(said.joint)
@@ -314,8 +309,8 @@ def _counted(labels: Sequence[str]) -> bool:
 
 def _distance(command: Channel, position: Channel) -> float:
     """How far a position is from a command (rms), in units of the position's own motion."""
-    at = np.clip(np.searchsorted(command.time, position.time, side="right") - 1, 0, None)
-    return float(np.sqrt(np.mean((command.values[at] - position.values) ** 2)) / (np.std(position.values) + 1e-3))
+    error = held(command.time, command.values, position.time) - position.values
+    return float(np.sqrt(np.mean(error**2)) / (np.std(position.values) + 1e-3))
 
 
 def _without_plans(picked: dict[str, dict[str, _Candidate]], notes: list[str]) -> dict[str, dict[str, _Candidate]]:

@@ -17,9 +17,10 @@ import numpy as np
 from pace_actuators.text import listed
 from pace_optim.recording import Recording, load_recording
 from pace_optim.recording.checks import check_recording
-from pace_optim.recording.files import SUFFIXES, add_json_facts, facts_notes, read_facts, with_shared_facts
+from pace_optim.recording.files import SUFFIXES, facts_beside, read_facts, with_facts, with_shared_facts
 from pace_optim.recording.keys import COMMAND_SERIES, CONDITIONS, DRIVE_FACTS, MEASURED_SERIES, SHARED_FACTS
-from pace_optim.recording.time_base import interpolate_linear, interpolate_smooth
+from pace_optim.recording.text_table import Head, head_of
+from pace_optim.recording.time_base import held, interpolate_linear, interpolate_smooth
 
 from .base import base_fields
 from .column_map import ColumnMap, Source, map_text, printable, write_map
@@ -27,7 +28,8 @@ from .guess import Robot, as_one, guess_map
 from .log import Channel, Log
 from .rosbag import read_rosbag
 from .tables import SUFFIXES as TABLES
-from .tables import Head, head_of, is_joint_table, read_csv_log, read_npz_log, read_parquet_log
+from .tables import read_csv_log, read_npz_log, read_parquet_log
+from .words import is_time, meaning
 
 BAGS = (".mcap", ".db3", ".bag")
 LOG_SUFFIXES = (*BAGS, ".parquet", *(each for each in TABLES if each not in SUFFIXES))
@@ -35,39 +37,6 @@ _OWN = {"dof_pos", "des_dof_pos"}
 """One of these is in every recording of this project's own form."""
 _JOIN = "+"
 """Between the files of one log: states.csv+commands.csv."""
-
-__all__ = ["LogReader", "Robot", "Understood", "is_log", "load_recordings", "paired_files", "understood"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Understood:
-    """One recording of a log, and how the log was read."""
-
-    recording: Recording
-    columns: ColumnMap
-    lines: tuple[str, ...]
-    """What was understood, for people."""
-
-
-def load_recordings(
-    path: str | os.PathLike[str],
-    robot: Robot | None = None,
-    columns: ColumnMap | None = None,
-    tell: Callable[[str], None] | None = None,
-) -> list[Recording]:
-    """Read the recordings of a file or folder: one, or one per episode.
-
-    Args:
-        path: A recording (.csv, .npz, .pt), a rosbag2 (.mcap, .db3, or its folder), a ROS 1 .bag, a .parquet, the
-            folder of a LeRobot dataset, a .csv with any names, or CSV files of one log joined by `+`.
-        robot: The robot's joints and limits; without it, the log's own names are kept.
-        columns: Which column is what; without it, it is guessed.
-    """
-    reader = LogReader([str(path)], columns)
-    found = reader.recordings(str(path), robot or Robot())
-    for line in reader.lines() if tell else ():
-        tell(line)  # type: ignore[misc]
-    return found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +56,9 @@ class LogReader:
         self, paths: Sequence[str], columns: ColumnMap | None = None, facts: str | os.PathLike[str] | None = None
     ):
         """Args:
-        paths: All files and folders, as :func:`load_recordings` takes one.
+        paths: All files and folders. One is a recording (.csv, .npz, .pt), a rosbag2 (.mcap, .db3, or its folder), a
+            ROS 1 .bag, a .parquet, the folder of a LeRobot dataset, a table with any names, or files of one log joined
+            by `+`.
         columns: Which column is what; without it, it is guessed.
         facts: JSON file of what is true of all recordings, where they do not state it.
         """
@@ -107,10 +78,10 @@ class LogReader:
         """The recordings of a file or folder."""
         if not is_log(Path(path), self._columns):
             return [load_recording(path, self._columns.rate if self._columns else 0.0, self._facts)]
-        return [each.recording for each in self.understood(path, robot)]
+        return [recording for recording, _ in self.understood(path, robot)]
 
-    def understood(self, path: str, robot: Robot) -> list[Understood]:
-        """Read a log and say what was understood."""
+    def understood(self, path: str, robot: Robot) -> list[tuple[Recording, ColumnMap]]:
+        """The recordings of a log, one or one per episode, and which column was taken for what."""
         columns = self._columns
         self._readings.pop(str(Path(path)), None)
         try:
@@ -146,11 +117,12 @@ class LogReader:
             self._together[key] = as_one(self._alike[key][:_ENOUGH])
         return self._together[key]
 
-    def _read(self, path: Path, log: Log, robot: Robot) -> Understood:
+    def _read(self, path: Path, log: Log, robot: Robot) -> tuple[Recording, ColumnMap]:
         used, notes = self._columns, list(log.notes)
         facts_from: tuple[str, ...] = ()
         unit_stated = () if used is None else tuple(used.joints)
         beside = _parts(path)[0]
+        stated, of_facts = facts_beside(beside)
         if used is None or not used.joints:
             guess = guess_map(log, robot, self._channels(log))
             own, facts_from, unit_stated = guess.columns, guess.facts_from, guess.unit_stated
@@ -160,16 +132,15 @@ class LogReader:
             if guess.missing:
                 raise ValueError(_what_is_missing(path, log, guess.missing, used, notes))
             used = replace(used, facts={**own.facts, **used.facts})
-            if twice := [key for key in own.facts if key in add_json_facts({}, beside)]:
+            if twice := [key for key in own.facts if key in stated]:
                 notes.append(f"{listed(twice)}: as the JSON file beside the log states it, not by the log's columns.")
                 used = replace(used, facts={key: value for key, value in used.facts.items() if key not in twice})
         names = _joints_of(path, used, robot)
         fields, more = fields_of(log, used, names)
         left = unused(log, used, facts_from)
-        notes += [*more, *facts_notes(beside), *([left] if left else [])]
-        reading = _Reading(path=path, log=log, columns=used, notes=tuple(notes))
-        self._readings.setdefault(str(path), reading)
-        fields = with_shared_facts(add_json_facts(fields, beside), self._facts, robot.joint_names)
+        notes += [*more, *of_facts, *([left] if left else [])]
+        self._readings.setdefault(str(path), _Reading(path=path, log=log, columns=used, notes=tuple(notes)))
+        fields = with_shared_facts(with_facts(fields, stated, beside), self._facts, robot.joint_names)
         try:
             recording = check_recording(fields, source=str(path), default_name=log.name)
         except ValueError as error:
@@ -178,8 +149,7 @@ class LogReader:
             raise
         if len(log.name) > len(path.stem):  # an episode, or a part
             recording = replace(recording, name=log.name)
-        recording = replace(recording, unit_stated=unit_stated, notes=(*recording.notes, *notes))
-        return Understood(recording=recording, columns=used, lines=tuple(_lines([reading])))
+        return replace(recording, unit_stated=unit_stated, notes=(*recording.notes, *notes)), used
 
 
 _ENOUGH = 20
@@ -240,17 +210,6 @@ def _parts(path: Path) -> list[Path]:
     return found if found and not begun and not path.exists() else [path]
 
 
-def understood(path: Path, robot: Robot, columns: ColumnMap | None = None) -> list[Understood]:
-    """Read a log alone and say what was understood.
-
-    Args:
-        path: As `load_recordings` takes it, less this project's own form.
-        robot: The robot's joints and limits, as far as they are known.
-        columns: Which column is what; without it, it is guessed.
-    """
-    return LogReader([str(path)], columns).understood(str(path), robot)
-
-
 def paired_files(paths: Sequence[str]) -> list[str]:
     """Join files that are two halves of one log: positions without commands, and commands without positions.
 
@@ -273,7 +232,9 @@ def _half(path: Path) -> str:
     """`states` or `commands` where a table has one of them alone, else ""."""
     if path.suffix.lower() not in TABLES or not path.is_file():
         return ""
-    positions, commands = is_joint_table(_head(path).names)
+    said = [meaning(name) for name in _head(path).names if not is_time(name)]
+    positions = any(each.quantity == "dof_pos" and not each.commanded for each in said)
+    commands = any(each.quantity and each.commanded for each in said)
     return "" if positions == commands else "states" if positions else "commands"
 
 
@@ -470,13 +431,10 @@ def fields_of(log: Log, columns: ColumnMap, joint_names: Sequence[str]) -> tuple
     else:
         des_time = time
     for series, part in commands.items():
-        fields[series] = _columns(part, joint_names, lambda p: p[1][np.searchsorted(p[0], des_time, side="right") - 1])
+        fields[series] = _columns(part, joint_names, lambda pair: held(pair[0], pair[1], des_time))
     if columns.torque_enable:
-        switch = log.channels.get(columns.torque_enable)
-        if switch is None:
-            raise ValueError(_unknown_channel(log, columns.torque_enable))
-        at = np.searchsorted(switch.time, time, side="right") - 1
-        fields["torque_enable"] = switch.values[np.clip(at, 0, None)]
+        switch = log.channel(columns.torque_enable)
+        fields["torque_enable"] = held(switch.time, switch.values, time)
     fields |= base_fields(log, columns.base, time)
     fields["time"] = time - first
     if log.time_origin or first:
@@ -508,17 +466,9 @@ def unused(log: Log, columns: ColumnMap, facts_from: Collection[str] = ()) -> st
     return f"Not used: {listed(names, len(names))}." if names else ""
 
 
-def _unknown_channel(log: Log, channel: str) -> str:
-    return (
-        f"{log.name}: the column map names '{channel}', which the log has not. It has: {listed(log.channels)}. Correct "
-        "the map."
-    )
-
-
 def _scaled(log: Log, series: str, source: Source) -> tuple[np.ndarray, np.ndarray]:
     """Instants and values in SI units at the joint."""
-    if (channel := log.channels.get(source.channel)) is None:
-        raise ValueError(_unknown_channel(log, source.channel))
+    channel = log.channel(source.channel)
     return channel.time, channel.values * source.scale(series) + source.offset
 
 
@@ -554,7 +504,7 @@ def rates_of(logs: Sequence[Log], columns: ColumnMap) -> list[str]:
             rates = list(dict.fromkeys(f"{rate:.4g}" for rate in sorted(each.rate for each in channels)))
             lines.append(
                 f"{series:15s} {listed(names, 6)}: {source.channel}{' …' if len(names) > 1 else ''}, "
-                f"{_terms(series, source)}, {sum(len(each.time) for each in channels)} values at "
+                f"{_terms(source)}, {sum(len(each.time) for each in channels)} values at "
                 f"{' to '.join([rates[0], *rates[1:][-1:]])} Hz, longest gap {gap * 1e3:.4g} ms"
             )
     return lines
@@ -571,7 +521,7 @@ def _alike(log: Log, by: Mapping[str, Source]) -> list[tuple[list[str], Source]]
     return list(groups.values())
 
 
-def _terms(series: str, source: Source) -> str:
+def _terms(source: Source) -> str:
     words = [source.unit]
     words += ["sign reversed"] if source.sign < 0 else []
     words += [f"offset {source.offset:g}"] if source.offset else []

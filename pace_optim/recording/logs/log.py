@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from pace_actuators.text import listed
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Channel:
@@ -29,6 +31,11 @@ class Channel:
     """The joint as the format calls it; "" where only the channel's name shows it."""
 
     @property
+    def name(self) -> str:
+        """Its key without the topic's or file's name."""
+        return self.key.removeprefix(self.table + ":") if self.table else self.key
+
+    @property
     def rate(self) -> float:
         """Values per second [Hz]."""
         return (len(self.time) - 1) / float(self.time[-1] - self.time[0]) if len(self.time) > 1 else 0.0
@@ -45,6 +52,15 @@ class Log:
     """Unix time where the channels' time is zero [s]; 0 where the log does not say."""
     notes: tuple[str, ...] = ()
     """What happened while reading."""
+
+    def channel(self, key: str) -> Channel:
+        """The channel that a column map names."""
+        if key not in self.channels:
+            raise ValueError(
+                f"{self.name}: the column map names '{key}', which the log has not. It has: {listed(self.channels)}. "
+                "Correct the map."
+            )
+        return self.channels[key]
 
 
 def cleaned(

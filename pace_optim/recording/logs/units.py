@@ -10,6 +10,7 @@ import numpy as np
 from pace_actuators.joint_units import JointType, units_for
 from pace_actuators.text import listed
 from pace_optim.recording.keys import CONDITIONS
+from pace_optim.recording.time_base import held
 
 from .log import Channel
 from .words import UNITS
@@ -71,7 +72,7 @@ def guessed_units(
         return _of_commands(channels, positions, of_positions, joint_type)
     if series in ("dof_vel", "des_dof_vel"):
         return _of_speeds(series, channels, positions, joint_type)
-    return _of_efforts(series, known, channels, joint_type)
+    return _of_efforts(known, channels, joint_type)
 
 
 def _of_positions(
@@ -132,7 +133,7 @@ def _by_gains(joint: Known, whole: str, small: str) -> str:
     effort, position, command = (joint.given.get(key) for key in ("dof_effort", "dof_pos", "des_dof_pos"))
     if effort is None or command is None or position is None or not joint.stiffness > 0:
         return ""
-    error = held(command, position.time) - position.values
+    error = held(command.time, command.values, position.time) - position.values
     torque = np.interp(position.time, effort.time, effort.values)
     columns = np.stack([error, np.gradient(position.values, position.time), np.ones(len(error))], axis=1)
     gain = float(np.linalg.lstsq(columns, torque, rcond=None)[0][0]) if len(error) > 3 else 0.0
@@ -155,7 +156,7 @@ def _of_commands(
     """Joints move as far as their commands; commands of joints that stand have the unit of the positions."""
     whole, small = _POSITIONS[joint_type]
     both = {
-        name: (positions[name].values, held(channel, positions[name].time))
+        name: (positions[name].values, held(channel.time, channel.values, positions[name].time))
         for name, channel in channels.items()
         if name in positions
     }
@@ -208,7 +209,7 @@ def _of_speeds(
 
 
 def _of_efforts(
-    series: str, known: Mapping[str, Known], channels: Mapping[str, Channel], joint_type: JointType
+    known: Mapping[str, Known], channels: Mapping[str, Channel], joint_type: JointType
 ) -> tuple[dict[str, str], list[str]]:
     """N m, unless the numbers are those of a register: whole, and beyond what the drive can give."""
     whole = units_for("N m", [joint_type])
@@ -225,8 +226,3 @@ def _of_efforts(
         f"{listed(registers)}: whole numbers, as of a register in permille, percent or mA, and no {whole}: left out. "
         "If you know what one is, give unit and factor in a column map."
     ]
-
-
-def held(channel: Channel, at: np.ndarray) -> np.ndarray:
-    """A channel's values as they are in force at some instants."""
-    return channel.values[np.clip(np.searchsorted(channel.time, at, side="right") - 1, 0, None)]

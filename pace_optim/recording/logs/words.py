@@ -28,16 +28,17 @@ UNITS: dict[str, dict[str, float]] = {
 }  # fmt: skip
 """Units of each quantity, in SI units; those of ``NEED_FACTOR`` want a factor too."""
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-_TIME_WORDS = {
-    unit: named
-    for named, spelt in (
+TIME_WORDS = {
+    word: unit
+    for unit, spelt in (
         ("s", "s sec secs second seconds"),
         ("ms", "ms msec msecs millis millisec millisecs milliseconds"),
         ("us", "us usec usecs micros microsec microsecs microseconds"),
         ("ns", "ns nsec nsecs nanosec nanosecs nanos nanoseconds"),
     )
-    for unit in spelt.split()
+    for word in spelt.split()
 }
+"""What units of time are called."""
 CURRENTS = ("A", "mA")
 NEED_FACTOR = {"A": "A", "mA": "A", "%": "100 %", "permille": "1000 permille"}
 """Units of efforts that are no torques, and what their factor [N m] is for one of."""
@@ -45,10 +46,8 @@ GAINS = {"kp": "stiffness", "stiffness": "stiffness", "kd": "damping", "damping"
 """Columns of gains: the word, and the fact that it is."""
 
 _TIMES = {
-    "t", "time", "times", "timestamp", "timestamps", "stamp", "stamps", "ts", "clock", "datetime", "date", "sec",
-    "secs", "second", "seconds", "msec", "msecs", "millis", "milliseconds", "usec", "usecs", "micros", "microseconds",
-    "nsec", "nsecs", "nanosec", "nanosecs", "nanos", "nanoseconds", "elapsed", "millisec", "millisecs", "microsec",
-    "microsecs", "zeit",
+    "t", "time", "times", "timestamp", "timestamps", "stamp", "stamps", "ts", "clock", "datetime", "date", "elapsed",
+    "zeit", *(word for word in TIME_WORDS if word not in TIME_UNITS),
 }  # fmt: skip
 _OF_TIMES = {
     "header", "ros", "log", "unix", "epoch", "since", "start", "utc", "from", "relative", "rel", "sim", "wall",
@@ -330,7 +329,7 @@ def is_time(name: str) -> bool:
 
 def time_unit(name: str) -> str:
     """The unit that a column of time states, or ""."""
-    found = [unit for word in words(name) if (unit := _TIME_WORDS.get(word))]
+    found = [unit for word in words(name) if (unit := TIME_WORDS.get(word))]
     return found[-1] if found else ""
 
 

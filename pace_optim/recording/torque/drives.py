@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -67,9 +67,8 @@ class MeasuredDrives:
 
     def to_dict(self) -> dict[str, dict[str, Any]]:
         """The laws for a JSON file, by joint and recording."""
-        drop = ("joint",)
         return {
-            joint: {name: {k: v for k, v in asdict(law).items() if k not in drop} for name, law in laws.items()}
+            joint: {name: {k: v for k, v in asdict(law).items() if k != "joint"} for name, law in laws.items()}
             for joint, laws in self.laws.items()
         }
 
@@ -115,7 +114,7 @@ def read_drives(
         taken_in.append(taken)
     every = [law for by_recording in laws.values() for law in by_recording.values() if follows(law)]
     bounds, sentence = _delay(every, delay_bounds, delay_mode, control_dt)
-    lines = [line_of_joint(list(by.values()), follows, control_dt, _type(j, slides)) for j, by in laws.items()]
+    lines = [_line_of_joint(list(by.values()), control_dt, _type(j, slides)) for j, by in laws.items()]
     return MeasuredDrives(
         recordings=tuple(changed),
         laws=laws,
@@ -216,16 +215,27 @@ def _with_feed_forward(recording: Recording, laws: Mapping[int, MeasuredLaw], se
 def _delay(
     laws: Sequence[MeasuredLaw], bounds: tuple[float, float], delay_mode: str, control_dt: float
 ) -> tuple[tuple[float, float] | None, str]:
-    """Where the delay lies by all torques [control steps], and what is to be said of it."""
+    """Where the delay is sought for what all torques say of it [control steps], and a sentence on that or why not."""
     known = [law for law in laws if law.stiffness > 0 or law.feed_forward is not None]
     if not known:
         return None, ""
     low = max(bounds[0], *(law.delay - law.resolution for law in known))
     high = min(bounds[1], *(law.delay + law.resolution for law in known))
-    late = all(law.feedback_lag > 0 and abs(law.delay) < law.resolution for law in known)
-    used = delay_mode == "command" and low < high and not late
-    span = (min(law.delay for law in known), max(law.delay for law in known))
-    return (low, high) if used else None, delay_sentence(span, (low, high), used, late, delay_mode, control_dt)
+    step = 1e3 * control_dt
+    if all(law.feedback_lag > 0 and abs(law.delay) < law.resolution for law in known):
+        return None, (
+            "In dof_effort the position is as late as the command: the log has its torques late, or the drives delay "
+            "their torque (--delay_mode effort)."
+        )
+    if delay_mode != "command":
+        return None, ""
+    if low < high:
+        return (low, high), f"By dof_effort the delay is sought from {step * low:.3g} to {step * high:.3g} ms."
+    first, last = min(law.delay for law in known), max(law.delay for law in known)
+    return None, (
+        f"By dof_effort the delays are {step * first:.3g} to {step * last:.3g} ms. No delay within the bounds fits all "
+        "of them, so it is sought within its bounds."
+    )
 
 
 _WORDS = {"stiffness": "stiffness", "damping": "damping", "effort_limit": "torque limit"}
@@ -239,17 +249,8 @@ _FACTORS = (
 _UNITS = {"stiffness": "N m/rad", "damping": "N m s/rad", "effort_limit": "N m"}
 
 
-def line_of_joint(
-    laws: Sequence[MeasuredLaw], follows: Callable[[MeasuredLaw], bool], control_dt: float, joint_type: JointType
-) -> str:
-    """One line on a joint, of all its recordings.
-
-    Args:
-        laws: Of the joint, one for each recording.
-        follows: Whether a torque follows a law.
-        control_dt: Control step [s].
-        joint_type: Whether the joint turns or slides.
-    """
+def _line_of_joint(laws: Sequence[MeasuredLaw], control_dt: float, joint_type: JointType) -> str:
+    """One line on a joint, of its laws in all recordings."""
     good = [law for law in laws if follows(law)]
     joint = laws[0].joint
     if not good:
@@ -304,40 +305,6 @@ def _unit_between(ratio: float) -> str:
         for own, what in ((factor, f"{words[0]} times that"), (1 / factor, f"{words[0]} times less")):
             if abs(ratio / own - 1) < _EXACT:
                 return f"{what}: {words[1]}"
-    return ""
-
-
-def delay_sentence(
-    span: tuple[float, float],
-    bounds: tuple[float, float],
-    used: bool,
-    late: bool,
-    delay_mode: str,
-    control_dt: float,
-) -> str:
-    """Where the delay is sought for what the torques say, or why they say nothing of it.
-
-    Args:
-        span: Smallest and largest delay of the joints [control steps].
-        bounds: Where all of them allow it [control steps].
-        used: Whether it is sought there.
-        late: Whether position and command are as late as each other in every torque.
-        control_dt: Control step [s].
-    """
-    low, high = (1e3 * control_dt * each for each in bounds)
-    if used:
-        return f"By dof_effort the delay is sought from {low:.3g} to {high:.3g} ms."
-    if late:
-        return (
-            "In dof_effort the position is as late as the command: the log has its torques late, or the drives delay "
-            "their torque (--delay_mode effort)."
-        )
-    if delay_mode == "command":
-        first, last = (1e3 * control_dt * each for each in span)
-        return (
-            f"By dof_effort the delays are {first:.3g} to {last:.3g} ms. No delay within the bounds fits all of them, "
-            "so it is sought within its bounds."
-        )
     return ""
 
 
@@ -416,18 +383,17 @@ def torque_channel(recordings: Sequence[Recording], measured: MeasuredDrives, wh
         raise NoTorqueError(
             f"--residual effort: no torque can be followed: {'; '.join(out)}. Fit with --residual position."
         )
-    notes = [f"dof_effort of {listed(joints, 6)} is left out of the residuals: {why}." for why, joints in out.items()]
-    notes.insert(
-        0,
-        f"The fit follows dof_effort of {listed(list(noise), 6)} beside the positions. What is read from it is a start "
-        "value.",
+    notes = (
+        f"The fit follows dof_effort of {listed(noise, 6)} beside the positions. What is read from it is a "
+        "start value.",
+        *(f"dof_effort of {listed(joints, 6)} is left out of the residuals: {why}." for why, joints in out.items()),
     )
     return TorqueChannel(
         noise=noise,
         floor={joint: _floor(recordings, joint, measured.laws[joint]) for joint in noise},
         lag={joint: float(np.median([law.feedback_lag for law in laws])) for joint, laws in known.items()},
         offsets={joint: _offsets(laws) for joint, laws in known.items()},
-        notes=tuple(notes),
+        notes=notes,
     )
 
 

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from pace_optim.recording import Recording
-from pace_optim.recording.time_base import interpolate_smooth
+from pace_optim.recording.time_base import held, interpolate_smooth
 
 _FEEDBACK_LAGS = np.arange(-1.0, 4.0)
 """Samples by which a log's torque may come later than the position or speed that it was made of."""
@@ -136,8 +136,7 @@ class Table:
 
 def _held(stamps: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Commands as they are in force at some times."""
-    tolerance = _TOLERANCE * float(stamps[1] - stamps[0])
-    return values[np.clip(np.searchsorted(stamps, at + tolerance, side="right") - 1, 0, None)]
+    return held(stamps, values, at + _TOLERANCE * float(stamps[1] - stamps[0]))
 
 
 def _commands(recording: Recording, j: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:

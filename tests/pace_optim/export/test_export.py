@@ -96,6 +96,18 @@ def test_the_mjcf_says_what_it_cannot_hold(result):
         assert word in said and word in exported.text.split("-->")[0]
 
 
+@pytest.mark.parametrize("fmt", [fmt for fmt in FORMATS if fmt != "json"])
+def test_each_format_says_that_it_lacks_a_parameter_of_the_task_alone(result, fmt):
+    exported = export(with_effects(result, [], {"torque_limit_at_rest": {"battery": 3.0}}), fmt)
+    (note,) = (each for each in exported.notes if "torque_limit_at_rest" in each)
+    assert "omitted" in note and "torque_limit_at_rest" in exported.text
+
+
+def test_json_has_a_parameter_of_the_task_alone(result):
+    content = json.loads(export(with_effects(result, [], {"torque_limit_at_rest": {"battery": 3.0}}), "json").text)
+    assert content["parameters"]["torque_limit_at_rest"] == {"battery": 3.0}
+
+
 def test_the_mjcf_holds_a_payload(result):
     share = {joint: 0.3 if joint == "LF_KFE" else 0.0 for joint in JOINTS}
     exported = export(with_effects(result, ["payload"], {"payload.ratio": share}), "mjcf")

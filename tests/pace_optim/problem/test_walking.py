@@ -15,9 +15,9 @@ from pace_optim.estimate.error_bars.assessment import _LATE, _late_forces
 from pace_optim.problem.free_phases import FreePhases, encoder_noise
 from pace_optim.problem.moving_base import base_path, imu_pose, joints_of_feet, on_moving_base
 from pace_optim.problem.problem import load_problem
+from pace_optim.recording.carried import Carried, force_noise, free_phases, part_of_phase
 from pace_optim.recording.data import ImuPose
 from pace_optim.recording.dataset import make_dataset
-from pace_optim.recording.moving_base import Carried, force_noise, free_phases, part_of_phase
 from pace_optim.recording.parts import informative_parts
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from command_lines import run_script
 from diagnoses import make_diagnosis
+from log_reading import load_recordings
 from models import GANTRY
 
 from pace_actuators.files import write_json
@@ -16,7 +17,7 @@ from pace_actuators.joint_units import units_for
 from pace_optim.data_collection import plot_motion
 from pace_optim.motion.signals import Trajectory
 from pace_optim.recording.conform import check_motion
-from pace_optim.recording.logs import Robot, load_recordings
+from pace_optim.recording.logs import Robot
 from pace_optim.report import report_text
 from pace_optim.report.plots import plot_trajectories
 from pace_optim.run.result import FitResult

@@ -33,7 +33,7 @@ from pace_optim.data_collection.plant import (
     simulate_truths,
     write_case,
 )
-from pace_optim.data_collection.plant.friction_solver import friction_impulse
+from pace_optim.data_collection.plant.dynamics import friction_impulse
 from pace_optim.data_collection.plant.suite import make_suite
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.rollout import Rollout

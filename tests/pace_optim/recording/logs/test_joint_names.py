@@ -5,9 +5,10 @@ import re
 
 import numpy as np
 import pytest
+from log_reading import understood
 from places import ROOT, SHARED
 
-from pace_optim.recording.logs import Robot, read_map, understood, write_map
+from pace_optim.recording.logs import Robot, read_map, write_map
 
 TIME = np.arange(400) / 200
 WORDS = (

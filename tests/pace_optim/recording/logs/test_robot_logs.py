@@ -9,12 +9,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from log_reading import load_recordings, understood
 from places import SHARED
 from recordings import says
 
 from pace_optim.commands import import_log
 from pace_optim.recording import load_recording, save_recording
-from pace_optim.recording.logs import Robot, load_recordings, paired_files, read_map, tables, understood, write_map
+from pace_optim.recording.logs import Robot, paired_files, read_map, tables, write_map
 from pace_optim.recording.logs.rosbag import rows_of
 from pace_optim.recording.logs.words import meaning
 from pace_optim.terminal.cli import run_cli

@@ -6,13 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from log_reading import load_recordings, understood
 from places import SHARED
 
 from pace_optim.recording import Recording, load_recording
 from pace_optim.recording.data import notes_by_kind
 from pace_optim.recording.dataset import start_speed
 from pace_optim.recording.gaps import split_at_gaps
-from pace_optim.recording.logs import ColumnMap, Robot, load_recordings, read_map, understood, with_rate
+from pace_optim.recording.logs import ColumnMap, Robot, read_map, with_rate
 from pace_optim.recording.time_base import set_back, unrounded
 
 TIME = np.arange(800) / 200

@@ -4,9 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from log_reading import load_recordings
 from recordings import says
 
-from pace_optim.recording.logs import load_recordings, read_map
+from pace_optim.recording.logs import read_map
 from pace_optim.recording.logs.base import BaseMap, Channels, base_fields, guess_base
 from pace_optim.recording.logs.column_map import map_text
 from pace_optim.recording.logs.log import Channel, Log

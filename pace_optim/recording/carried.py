@@ -1,9 +1,10 @@
-"""Recordings of a robot whose base moves: how its model's frame moves, and when its joints move freely."""
+"""What recordings show of joints that a moving base carries; `problem/moving_base` brings it onto a robot's model."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -53,16 +54,9 @@ class Carried:
     def select(self, recordings: Sequence[int]) -> Carried:
         """Some of the recordings, by index."""
         chosen = list(recordings)
-        return Carried(
-            base=self.base[:, chosen],
-            point=self.point[chosen],
-            measured=self.measured[:, chosen],
-            free=self.free[:, chosen],
-            start_std=self.start_std[chosen],
-            force_std=self.force_std[:, chosen],
-        )
+        return replace(self.at(slice(None), chosen), free=self.free[:, chosen])
 
-    def at(self, step: torch.Tensor, recording: torch.Tensor) -> Carried:
+    def at(self, step: Any, recording: Any) -> Carried:
         """Parts of the recordings: of each (W,) those control steps (T', W). Each begins where it was measured."""
         free = self.free[step, recording].clone()
         free[0] = False
@@ -78,13 +72,11 @@ class Carried:
     def on_joints(self, joints: Sequence[int]) -> Carried:
         """The same of some of the joints, by index."""
         chosen = list(joints)
-        return Carried(
-            base=self.base,
-            point=self.point,
+        return replace(
+            self,
             measured=self.measured[..., chosen, :],
             free=self.free[..., chosen],
             start_std=self.start_std[:, chosen],
-            force_std=self.force_std,
         )
 
     def motion(self, parts: int, control_dt: float, loop_dt: float = 0.0) -> torch.Tensor:
