@@ -10,6 +10,7 @@ import pytest
 from command_lines import run_script
 from diagnoses import make_diagnosis
 from models import GANTRY
+from report_pages import contents_of
 
 from pace_actuators.files import write_json
 from pace_actuators.joint_units import units_for
@@ -103,7 +104,7 @@ def test_the_comparison_tells_each_in_its_unit(fitted):
     page = report_text(run).decode()
     assert "<b>axis [mm]</b>" in page and "<b>swing [mrad]</b>" in page
     assert "Armature <small>kg</small>" in page and "Armature <small>kg m²</small>" in page  # an axis for each
-    assert '"position_unit":"m"' in page and '"position_unit":"rad"' in page
+    assert '"position_unit":"m"' in (data := contents_of(page)) and '"position_unit":"rad"' in data
     assert "position [m]" in page and "position [rad]" in page and "load force [N]" in page
 
 
