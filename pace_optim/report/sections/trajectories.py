@@ -105,7 +105,7 @@ def samples_to_draw(curves: tuple[np.ndarray, ...], most: int) -> np.ndarray:
     grid = np.minimum(np.arange(-(-count // width) * width), count - 1).reshape(-1, width)
     rows = np.arange(len(grid))
     kept = [np.array([0, count - 1])]
-    for curve in curves:
-        values = np.nan_to_num(curve)[grid]
+    for each in curves:
+        values = np.nan_to_num(each)[grid]
         kept += [grid[rows, values.argmin(axis=1)], grid[rows, values.argmax(axis=1)]]
     return np.unique(np.concatenate(kept))
