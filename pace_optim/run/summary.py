@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pace_actuators.drive_result import ALL
 from pace_actuators.joint_units import JOINT_TYPES, JointType, units_for
-from pace_actuators.text import shortened
+from pace_actuators.text import aligned, in_short, shortened
 from pace_optim.run.result import FitResult
 from pace_optim.terminal.cli import command
 
@@ -19,12 +19,11 @@ _FEW = 6
 
 def summary(result: FitResult) -> list[str]:
     """The table of parameters with error bars, the errors and the three first warnings, a line each."""
-    width = max(len(joint) for joint in [*result.joint_names, "joint"])
     lines: list[str] = []
     for joint_type in JOINT_TYPES:
         joints = [joint for joint in result.joint_names if result.joint_type(joint) == joint_type]
         base = [name for name in result.joint_parameters if "." not in name]
-        lines += _table(result, base, joints, joint_type, width)
+        lines += _table(result, base, joints, joint_type)
     lines += _effects(result)
     lines += _links(result)
     for name, values in result.parameters.items():
@@ -50,7 +49,8 @@ def summary(result: FitResult) -> list[str]:
         f"stopped: {'; '.join(result.stop_reasons)}"
     )
     lines += [f"note: {finding}" for finding in result.findings]
-    lines += [f"warning: {warning}" for warning in shortened(result.warnings, "warning")]
+    for warning in shortened(result.warnings, "warning"):
+        lines += f"warning: {warning}".split("\n")  # some have a table below
     return lines + ["meaning and cure of each code: docs/faq.md"] * any("[W" in warning for warning in result.warnings)
 
 
@@ -92,7 +92,7 @@ def _torque_errors(result: FitResult) -> list[str]:
     ]
 
 
-def _table(result: FitResult, names: list[str], joints: list[str], joint_type: JointType, width: int) -> list[str]:
+def _table(result: FitResult, names: list[str], joints: list[str], joint_type: JointType) -> list[str]:
     """The joints of one type, a line each, under a head with their units."""
     if not joints:
         return []
@@ -101,9 +101,8 @@ def _table(result: FitResult, names: list[str], joints: list[str], joint_type: J
     columns = [[f"{name} [{unit[name]}]", *(_value(result, name, joint) for joint in joints)] for name in names]
     head = units_for("train / validation [mrad]", [joint_type])
     columns.append([head, *(errors_of(result, joint) for joint in joints)])
-    aligned = [[cell.rjust(max(map(len, column))) for cell in column] for column in columns]
-    rows = zip([name.ljust(width) for name in ("joint", *joints)], *aligned, strict=True)
-    return [*("  ".join(row) for row in rows), ""]
+    names_shown, pattern = in_short(joints)
+    return [*aligned([[f"joint {pattern}".strip(), *names_shown], *columns]), ""]
 
 
 def _effects(result: FitResult) -> list[str]:

@@ -85,7 +85,7 @@ class ProgressLine:
     def tell(self, *lines: str) -> None:
         """Show lines that stay."""
         self.end_line()
-        print(*lines, sep="\n", file=self._stream, flush=True)
+        print(*(part for line in lines for part in line.split("\n")), sep="\n", file=self._stream, flush=True)
 
     def end_line(self) -> None:
         """End a line that is open, as something else follows."""

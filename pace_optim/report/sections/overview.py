@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from textwrap import dedent
 
 import numpy as np
 from markupsafe import Markup
@@ -165,7 +166,7 @@ def _warnings(result: FitResult) -> Markup:
             text += f" But the training error is {more}."
         return html('<div class="callout good"><h3>No warnings of parameters</h3><p>{{ text }}</p></div>', text=text)
     title = "1 warning" if count == 1 else f"{count} warnings"
-    sentences = [pretty_unit(text) for text in result.warnings]
+    sentences = [_with_table(pretty_unit(text)) for text in result.warnings]
     most = SHOWN if count > SHOWN + 1 else count  # one more takes no more room than its heading would
     said = bullets(sentences[:most])
     if rest := sentences[most:]:
@@ -175,6 +176,12 @@ def _warnings(result: FitResult) -> Markup:
         "<small>(meaning and cure of each code: docs/faq.md)</small></h3>{{ said }}</div>"
     )
     return html(text, title=title, said=said)
+
+
+def _with_table(warning: str) -> Markup:
+    """A warning, and the table below it that some have."""
+    sentence, _, lines = warning.partition("\n")
+    return html("{{ sentence }}{% if lines %}<pre>{{ lines }}</pre>{% endif %}", sentence=sentence, lines=dedent(lines))
 
 
 def _errors_by_joint(result: FitResult) -> Markup:
