@@ -103,9 +103,15 @@ def capitalised(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
+def spoken(name: str) -> str:
+    """A parameter's name in a sentence: ``payload.mass`` becomes "payload mass", ``torque_gain.gain`` "torque gain"."""
+    effect, _, parameter = name.replace("_", " ").partition(".")
+    return f"{effect} {parameter}".strip() if effect.split()[-1:] != [parameter] else effect
+
+
 def in_words(name: str) -> str:
     """A parameter's name as a heading: ``viscous_friction`` becomes "Viscous friction"."""
-    return capitalised(name.replace("_", " ").replace(".", ": "))
+    return capitalised(spoken(name))
 
 
 def pretty_unit(unit: str) -> str:
