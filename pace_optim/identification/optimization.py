@@ -477,8 +477,8 @@ class Optimization:
         history.search_time_s.append(self.progress.elapsed)
         self.log.log_generation(optimizer)
         spread = float(optimizer.spread.max())
-        error = self._in_words(optimizer.best_score)
-        self.progress.show(self._search_name, optimizer.generation, cfg.max_iteration, error, spread, self.steps)
+        best = f"best candidate {self._in_words(optimizer.best_score).removeprefix('error ')}"
+        self.progress.show(self._search_name, optimizer.generation, cfg.max_iteration, best, spread, self.steps)
         self._keep_process(optimizer)
         if optimizer.generation % cfg.save_interval == 0:
             self._write_mean(optimizer)
@@ -506,7 +506,10 @@ class Optimization:
             self.log.log_refinement(now.iteration, best)
         name = "fit on pieces" if on_pieces else "fit on whole recordings"
         name += f" from start {number}" if number > 1 else ""
-        self.progress.show(name, now.iteration, cfg.max_iteration, self._in_words(now.score), None, self.steps)
+        error = self._in_words(now.score)
+        if on_pieces:  # they begin where the robot was, so their error is smaller than that of recordings
+            error = error.replace("error", "error of pieces", 1)
+        self.progress.show(name, now.iteration, cfg.max_iteration, error, None, self.steps)
         self.folder.write_mean(self.history.iterations, self.problem.space.to_physical(self._best_so_far()))
         self._write_checkpoint()
 
