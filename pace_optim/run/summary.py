@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
 
 from pace_actuators.drive_result import ALL
 from pace_actuators.joint_units import JOINT_TYPES, JointType, units_for
-from pace_actuators.text import aligned, in_short, shortened
+from pace_actuators.text import aligned, conjoined, in_short, percent, shortened
 from pace_optim.run.result import FitResult
 from pace_optim.terminal.cli import command
 
 ABOVE_NOISE = 1.5
 """Times the noise above which an error has causes beside it."""
+_NEARLY_ALL = 0.9
+"""Part of the squared error that a few joints hold where the others need no look."""
 _FEW = 6
 """Values of an effect that a line shows; curves have more."""
 
@@ -39,6 +42,8 @@ def summary(result: FitResult) -> list[str]:
     if result.times_noise and not result.std_means_nothing:
         said = above_noise(result) or f"{result.times_noise:.3g} times the measurement noise"
         lines.append(f"training error: {said}")
+    if few := few_joints(result):
+        lines.append(few)
     if result.torque_noise:
         lines.append(f"error of torques: {', '.join(_torque_errors(result))} (train / validation)")
     if result.objective:
@@ -58,6 +63,28 @@ def above_noise(result: FitResult) -> str:
     """How far above the noise a fit has ended, where something is missing; else empty."""
     times = result.times_noise or 0.0
     return f"{times:.3g} times the measurement noise: something is missing" if times >= ABOVE_NOISE else ""
+
+
+def few_joints(result: FitResult) -> str:
+    """Which few joints hold nearly all of an error above the noise, on held-out data if there is some; else ""."""
+    errors = result.rmse.get("validation") or result.rmse["train"]
+    return carried_by(errors) if (result.times_noise or 0.0) >= ABOVE_NOISE else ""
+
+
+def carried_by(errors: Mapping[str, float | None]) -> str:
+    """Which few joints hold nearly all of the squared error, in a sentence; "" where many do.
+
+    Args:
+        errors: RMSE by joint.
+    """
+    squares = {joint: error**2 for joint, error in errors.items() if joint != ALL and error is not None}
+    order, total = sorted(squares, key=squares.__getitem__, reverse=True), sum(squares.values())
+    for count in range(1, len(order) // 3 + 1):
+        share = sum(squares[joint] for joint in order[:count]) / total if total else 0.0
+        if share >= _NEARLY_ALL:
+            first = [joint for joint in squares if joint in order[:count]]
+            return f"{conjoined(first)} hold{'s' if count == 1 else ''} {percent(share)} of the squared error."
+    return ""
 
 
 def error_line(result: FitResult, of: str = "error, all joints") -> str:

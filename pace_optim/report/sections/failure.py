@@ -42,11 +42,10 @@ def failure(run: RunData) -> Section | None:
         title="Where the model fails",
         lead=content["summary"] + _basis(content),
         html=html(
-            '{{ places }}{{ by_joint }}{{ notes }}<div class="chooser">{{ recording }}{{ joint }}'
+            '{{ by_joint }}{{ notes }}<div class="chooser">{{ recording }}{{ joint }}'
             '{% for name, made in figures.items() %}<div data-figure="{{ name }}"><h3>{{ made.title }}</h3>'
             '<p class="said"></p><div class="canvas" style="height:{{ made.height }}px"></div></div>{% endfor %}'
             "{{ script }}</div>",
-            places=_places(content),
             by_joint=_by_joint(content),
             notes=bullets(content["notes"], "notes") if content["notes"] else "",
             recording=choice("recording", recordings, "failure-", r),
@@ -67,15 +66,6 @@ def _worst_place(content: dict[str, Any]) -> tuple[int, int]:
 
 def _basis(content: dict[str, Any]) -> str:
     return f" On {', '.join(content['data'])}, which are not the run's own recordings." if content["data"] else ""
-
-
-def _places(content: dict[str, Any]) -> Markup:
-    """The worst places, one sentence each; a click shows the joint's curves."""
-    return html(
-        '{% if places %}<ol class="places">{% for place in places %}<li><a href="#failure" '
-        'data-joint="{{ place.joint }}">{{ place.sentence }}</a></li>{% endfor %}</ol>{% endif %}',
-        places=content["worst_places"],
-    )
 
 
 def _by_joint(content: dict[str, Any]) -> Markup:

@@ -13,7 +13,7 @@ from pace_actuators.drive_result import ALL
 from pace_actuators.joint_units import JointType, joint_label, units_for
 from pace_actuators.text import SHOWN, duration, position_text, position_unit, pretty_unit, three_figures
 from pace_optim.run.result import FitResult
-from pace_optim.run.summary import ABOVE_NOISE, above_noise, next_lines
+from pace_optim.run.summary import ABOVE_NOISE, above_noise, few_joints, next_lines
 
 from ..markup import Section, bullets, folded, html
 from ..run_data import RunData
@@ -85,10 +85,11 @@ def _verdict(run: RunData) -> str:
     if len(run.result.joint_names) > 1:
         worst, where = _worst_joint(run.result)
         sentences.append(f"The worst joint is {worst} with {position_text(where, [run.result.joint_type(worst)])}.")
+    sentences.append(few_joints(run.result))
     last = run.result.stop_reasons[-1] if run.result.stop_reasons else ""
     if last.startswith(_STOPPED_EARLY):
         sentences.append(f"The fit was stopped before it had converged ({last}): going on may lower the error.")
-    return " ".join(sentences)
+    return " ".join(filter(None, sentences))
 
 
 def _next(run: RunData) -> str:
