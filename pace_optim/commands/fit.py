@@ -35,7 +35,7 @@ _SHARES = {
 """Part of a fit's time that has passed where a step begins: medians of 20 fits of 8 robots."""
 _SHARES_WITH_RATES = {
     **{step: 0.55 * share for step, share in _SHARES.items()},
-    "simulating other rates": 0.42,
+    "simulating other loop rates": 0.42,
     "simulating with a finer step": 0.9,
     "fitting again": 0.93,
 }

@@ -309,7 +309,7 @@ class Optimization:
             if period == problem.loop_dt or least.score <= _IN_DOUBT**2 * noise:
                 continue
             rate = f"at {1e-3 / period:g} kHz" if period else "continuously"
-            self.progress.say(f"error above the noise: fitting drive loops that run {rate}, as none is stated")
+            self.progress.say(f"above the noise: fitting drive loops that run {rate}, as none is stated (--drive_dt)")
             other = self._course(problem.with_loop(period), OTHER_LOOP.format(period))
             end = other.way.begin([least.x])
             if end.score < least.score:
