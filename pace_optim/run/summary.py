@@ -142,8 +142,12 @@ def _effects(result: FitResult) -> list[str]:
             rows.setdefault((effect, joint), []).append(text)
     if not rows:
         return []
-    cells = [(*key, ", ".join(v) if len(v) <= _FEW else f"{len(v)} values: see the report") for key, v in rows.items()]
-    table = [("effect", "joint", "values"), *cells]
+    short, pattern = in_short(result.joint_names)
+    shown = dict(zip(result.joint_names, short, strict=True))
+    table = [("effect", f"joint {pattern}".strip(), "values")]
+    for (effect, joint), own in rows.items():
+        values = ", ".join(own) if len(own) <= _FEW else f"{len(own)} values: see the report"
+        table.append((effect, shown.get(joint, joint), values))
     first, second = (max(len(row[i]) for row in table) for i in (0, 1))
     return [*(f"{effect:<{first}}  {joint:<{second}}  {values}" for effect, joint, values in table), ""]
 
