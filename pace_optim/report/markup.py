@@ -15,6 +15,8 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
+from pace_actuators.text import in_short
+
 ENVIRONMENT = Environment(
     autoescape=True,
     undefined=StrictUndefined,
@@ -116,19 +118,21 @@ def log_step(values: Iterable[float | None]) -> float | str:
 
 
 def choice(name: str, entries: Sequence[str], group: str = "", at: int = 0) -> Markup:
-    """Radio buttons that look like pills: arrow keys go from one to the next.
+    """Radio buttons that look like pills: arrow keys go from one to the next. What all names share stands before them.
 
     Args:
         group: Sets them apart from another choice of the same on the page.
         at: Which one the page opens on.
     """
+    shown, pattern = in_short(entries)
     return html(
         '<div class="pills" role="radiogroup" aria-label="{{ name }}" data-choice="{{ name }}"{{ hidden }}>'
-        "<b>{{ name.capitalize() }}</b><div>{% for entry in entries %}"
+        "<b>{{ name.capitalize() }}{% if pattern %}<br>{{ pattern }}{% endif %}</b><div>{% for entry in entries %}"
         '<label><input type="radio" name="{{ group + name }}" value="{{ loop.index0 }}"'
         '{{ " checked" if loop.index0 == at }}><span>{{ entry }}</span></label>{% endfor %}</div></div>',
         name=name,
-        entries=entries,
+        entries=shown,
+        pattern=pattern,
         group=group,
         at=at,
         hidden=" hidden" if len(entries) == 1 and name == "recording" else "",

@@ -10,7 +10,7 @@ from typing import Any
 from markupsafe import Markup
 
 from pace_actuators.joint_units import JointType, joint_label, units_for
-from pace_actuators.text import percent, position_text, position_unit, short_duration, three_figures
+from pace_actuators.text import in_short, percent, position_text, position_unit, short_duration, three_figures
 
 from ..markup import Section, bullets, choice, html, json_script, log_step, table
 from ..run_data import RunData
@@ -74,9 +74,10 @@ def _by_joint(content: dict[str, Any]) -> Markup:
     types = [own for joint in joints.values() for own in types_of(joint)]
     factor, unit = position_unit([joint["rmse"].get(part) for joint in joints.values() for part in parts], ["hinge"])
     rows = []
-    for (name, joint), own in zip(joints.items(), types, strict=True):
+    short, pattern = in_short(list(joints))
+    for (name, joint), shown, own in zip(joints.items(), short, types, strict=True):
         share = joint["share_above_floor"]
-        label = joint_label(name, own, types, unit)
+        label = joint_label(shown, own, types, unit)
         rows.append(
             [
                 html('<a href="#failure" data-joint="{{ name }}"><b>{{ label }}</b></a>', name=name, label=label),
@@ -91,7 +92,13 @@ def _by_joint(content: dict[str, Any]) -> Markup:
             ]
         )
     unit, words = units_for(unit, types), {"train": "training", "validation": "validation"}
-    head = ["joint", *(f"{words[part]} [{unit}]" for part in parts), f"noise [{unit}]", "error² above noise", "where"]
+    head = [
+        f"joint {pattern}".strip(),
+        *(f"{words[part]} [{unit}]" for part in parts),
+        f"noise [{unit}]",
+        "error² above noise",
+        "where",
+    ]
     return table(head, rows, "by-joint")
 
 

@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from pace_actuators.drive_result import ALL
 from pace_actuators.joint_units import JointType, joint_label, units_for
-from pace_actuators.text import SHOWN, duration, position_text, position_unit, pretty_unit, three_figures
+from pace_actuators.text import SHOWN, duration, in_short, position_text, position_unit, pretty_unit, three_figures
 from pace_optim.run.result import FitResult
 from pace_optim.run.summary import ABOVE_NOISE, above_noise, few_joints, next_lines
 
@@ -191,7 +191,8 @@ def _errors_by_joint(result: FitResult) -> Markup:
     every = [value for _, errors in parts for joint, value in errors.items() if joint != ALL]
     types = result.joint_types
     factor, unit = position_unit(every, ["hinge"])
-    labels = [joint_label(j, own, types, unit) for j, own in zip(result.joint_names, types, strict=True)]
+    names, pattern = in_short(result.joint_names)
+    labels = [joint_label(j, own, types, unit) for j, own in zip(names, types, strict=True)]
     largest = max([value for value in every if np.isfinite(value)], default=1.0) or 1.0
     rows = {
         (joint, label): [
@@ -201,13 +202,14 @@ def _errors_by_joint(result: FitResult) -> Markup:
         for joint, label in zip(result.joint_names, labels, strict=True)
     }
     return html(
-        '<h3>Error of each joint [{{ unit }}] {% for name in names %}<span class="key {{ name }}">'
+        '<h3>Error of each joint {{ pattern }} [{{ unit }}] {% for name in names %}<span class="key {{ name }}">'
         '{{ words[name] }}</span>{% endfor %}</h3><div class="errors">{% for (joint, label), bars in rows.items() %}'
         '<a class="error" href="#trajectories" data-joint="{{ joint }}"><b>{{ label }}</b><div>'
         '{% for name, width, value in bars %}<div class="bar {{ name }}"><i style="width:{{ width }}%"></i>'
         "<span>{{ value }}</span></div>{% endfor %}</div></a>{% endfor %}</div>",
         unit=units_for(unit, types),
         names=[name for name, _ in parts],
+        pattern=pattern,
         words={"train": "training", "validation": "validation"},
         rows=rows,
     )
