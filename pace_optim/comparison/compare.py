@@ -158,10 +158,10 @@ def _summary(compared: Sequence[JointComparison]) -> str:
 
 def _carried(joints: Sequence[str], compared: Sequence[JointComparison]) -> str:
     """Which few joints hold nearly all error above the noise; "" where many do, or all are explained."""
-    left = {}
-    for joint, own in zip(joints, compared, strict=True):
-        rmse = own.content["rmse"]
-        left[joint] = 0.0 if _explained(own.content) else rmse.get("validation", rmse.get("train"))
+    left = {
+        joint: 0.0 if _explained(own.content) else max(own.content["rmse"].values())
+        for joint, own in zip(joints, compared, strict=True)
+    }
     return carried_by(left)
 
 

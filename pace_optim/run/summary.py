@@ -66,8 +66,9 @@ def above_noise(result: FitResult) -> str:
 
 
 def few_joints(result: FitResult) -> str:
-    """Which few joints hold nearly all of an error above the noise, on held-out data if there is some; else ""."""
-    errors = result.rmse.get("validation") or result.rmse["train"]
+    """Which few joints hold nearly all of an error above the noise, in training or held out; else ""."""
+    train, held_out = result.rmse["train"], result.rmse.get("validation", {})
+    errors = {joint: max(error or 0.0, held_out.get(joint) or 0.0) for joint, error in train.items()}
     return carried_by(errors) if (result.times_noise or 0.0) >= ABOVE_NOISE else ""
 
 
