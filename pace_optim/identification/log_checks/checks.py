@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -733,26 +733,28 @@ def check_log(problem: Problem) -> list[Finding]:
                 limits={name: max((f.limits[name] for f in each), key=lambda own: own[1]) for name in each[0].limits},
             )
             for each in merged.values()
-        ]
+        ],
+        views[0].joints,
     )
 
 
-def _with_limits_together(found: list[Finding]) -> list[Finding]:
-    """Findings with one of each check for all joints whose limits are wrong."""
+def _with_limits_together(found: list[Finding], order: Sequence[str]) -> list[Finding]:
+    """Findings with one of each check for all joints whose limits are wrong, in the robot's order."""
     result: list[Finding] = []
     for each in found:
         at = next((i for i, one in enumerate(result) if each.limits and one.limits and one.check == each.check), None)
         if at is None:
             result.append(each)
             continue
-        one = result[at]
+        one, joints = result[at], sorted((*result[at].joints, *each.joints), key=list(order).index)
+        limits = {**one.limits, **each.limits}
         result[at] = replace(
             one,
             recordings=tuple(dict.fromkeys((*one.recordings, *each.recordings))),
-            joints=(*one.joints, *each.joints),
+            joints=tuple(joints),
             before=max(one.before or 0.0, each.before or 0.0),
             after=max(one.after, each.after),
-            limits={**one.limits, **each.limits},
+            limits={joint: limits[joint] for joint in joints},
         )
     return result
 

@@ -108,6 +108,7 @@ def test_refuted_limits_of_all_joints_are_one_warning_with_the_facts_to_state(tm
     assert sentence.endswith("[W3]") and len(rows) > 1
     assert [word for word in ("joint", "stated", "shows") if word in head] == ["joint", "stated", "shows"]
     needed = json.loads(f"{{{fact}}}")["effort_limit"]
+    assert [row.split()[0] for row in rows] == [j for j in made.recording.joint_names if j in needed]
     for row in rows:
         joint, stated, shown = row.split()
         assert float(shown) == needed[joint] > float(stated)
