@@ -117,11 +117,12 @@ class Finding:
         names, pattern = in_short(list(self.limits))
         unit = units_for("N m", [types[joint] for joint in self.limits])
         stated, shown = zip(*self.limits.values(), strict=True)
+        seen = "needed" if self.check == _LIFTED.name else "seen"
         rows = aligned(
             [
                 [f"joint {pattern}".strip(), *names],
                 [f"stated [{unit}]", *stated],
-                [f"motion shows [{unit}]", *(f"{value:.3g}" for value in shown)],
+                [f"{seen} [{unit}]", *(f"{value:.3g}" for value in shown)],
             ]
         )
         fact = json.dumps({joint: float(f"{value:.3g}") for joint, (_, value) in self.limits.items()})

@@ -82,6 +82,12 @@ def test_many_warnings_do_not_hide_the_page(tmp_path, count, folded):
     assert (f"<summary>{folded} more</summary>" in rest) == bool(folded)
 
 
+def test_a_warning_s_table_keeps_its_columns(tmp_path):
+    warning = 'limits are wrong [W3]\n  joint  stated\n  knee       30\n  "effort_limit": {"knee": 50.0}'
+    html = write_report(write_run(tmp_path / "run", make_result(warnings=[warning]))).read_text("utf-8")
+    assert '<pre class="rows">joint  stated\nknee       30</pre><pre>&#34;effort_limit&#34;' in html
+
+
 def test_warnings_come_before_everything_else(tmp_path):
     text = page_of(write_run(tmp_path / "run", make_result(warnings=["friction of hip is at its upper bound"]))).text
     assert text.index("1 warning: read before") < text.index("Error of each joint") < text.index("Drag to zoom")
