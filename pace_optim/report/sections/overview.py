@@ -180,9 +180,11 @@ def _warnings(result: FitResult) -> Markup:
 
 
 def _with_table(warning: str) -> Markup:
-    """A warning, and the table below it that some have."""
+    """A warning, with the table and the line to copy below it that some have."""
     sentence, _, lines = warning.partition("\n")
-    return html("{{ sentence }}{% if lines %}<pre>{{ lines }}</pre>{% endif %}", sentence=sentence, lines=dedent(lines))
+    rows, _, line = dedent(lines).rpartition("\n")
+    text = '{{ sentence }}{% if line %}<pre class="rows">{{ rows }}</pre><pre>{{ line }}</pre>{% endif %}'
+    return html(text, sentence=sentence, rows=rows, line=line)
 
 
 def _errors_by_joint(result: FitResult) -> Markup:
