@@ -62,6 +62,11 @@ def aligned(columns: Sequence[Sequence[str]]) -> list[str]:
     ]
 
 
+def with_table(text: str) -> list[str]:
+    """The lines of a message with a table below it; a line break in a name stays one, as no table line begins there."""
+    return re.split(r"\n(?=  )", text)
+
+
 def conjoined(names: Iterable[object]) -> str:
     """Names in a sentence: "a, b and c"."""
     *first, last = [str(name) for name in names]

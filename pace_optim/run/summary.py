@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pace_actuators.drive_result import ALL
 from pace_actuators.joint_units import JOINT_TYPES, JointType, units_for
-from pace_actuators.text import aligned, conjoined, in_short, percent, shortened
+from pace_actuators.text import aligned, conjoined, in_short, percent, shortened, with_table
 from pace_optim.run.result import FitResult
 from pace_optim.terminal.cli import command
 
@@ -55,7 +55,7 @@ def summary(result: FitResult) -> list[str]:
     )
     lines += [f"note: {finding}" for finding in result.findings]
     for warning in shortened(result.warnings, "warning"):
-        lines += f"warning: {warning}".split("\n")  # some have a table below
+        lines += with_table(f"warning: {warning}")
     return lines + ["meaning and cure of each code: docs/faq.md"] * any("[W" in warning for warning in result.warnings)
 
 

@@ -10,6 +10,8 @@ import time
 from collections.abc import Mapping
 from typing import ClassVar, TextIO
 
+from pace_actuators.text import with_table
+
 _TIMES = 3
 """Times that a counter's line shows, at most, before it is written anew."""
 _MOST_TIMES = 8
@@ -115,7 +117,7 @@ class ProgressLine:
     def tell(self, *lines: str) -> None:
         """Show lines that stay."""
         self.end_line()
-        print(*(part for line in lines for part in line.split("\n")), sep="\n", file=self._stream, flush=True)
+        print(*(part for line in lines for part in with_table(line)), sep="\n", file=self._stream, flush=True)
 
     def end_line(self) -> None:
         """End a line that is open, as something else follows."""
