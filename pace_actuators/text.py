@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Sequence
+from itertools import takewhile
 from typing import Any
 
 from pace_actuators.joint_units import JointType, units_for
@@ -13,6 +14,10 @@ _POSITIONS = ((1e-4, 1e3, "mrad"), (1e-7, 1e6, "µrad"), (0.0, 1e9, "nrad"))
 _MOST_DECIMALS = 6
 SHOWN = 3
 """Sentences of a kind that are shown in full; the others are folded."""
+_MARKS = "_/-. :"
+"""At which a name may be cut."""
+_SHARED = 8
+"""Letters that names must share to be shortened."""
 _CODE = re.compile(r"\[(W\d+)\]")
 
 
@@ -21,6 +26,45 @@ def listed(names: Iterable[object], most: int = 40) -> str:
     texts = [str(name) for name in names]
     more = f" and {len(texts) - most} more" if len(texts) > most else ""
     return ", ".join(texts[:most]) + more or "none"
+
+
+def in_short(names: Sequence[str]) -> tuple[list[str], str]:
+    """Names of a table without a long beginning and end that all share, and what was left out: "arm_left_…_joint".
+
+    Returns:
+        The names, and the pattern; "" if they share less than eight letters.
+    """
+    if len(names) < 2:
+        return list(names), ""
+    first = _beginning(names)
+    begin = first[: max(first.rfind(mark) for mark in _MARKS) + 1]
+    rests = [name[len(begin) :] for name in names]
+    last = _beginning([rest[::-1] for rest in rests])[::-1]
+    end = last[min((last.find(mark) for mark in _MARKS if mark in last), default=len(last)) :]
+    short = [rest[: len(rest) - len(end)] for rest in rests]
+    if len(begin) + len(end) < _SHARED or not all(short):
+        return list(names), ""
+    return short, f"{begin}…{end}"
+
+
+def _beginning(names: Sequence[str]) -> str:
+    """The letters with which all names begin."""
+    return "".join(letters[0] for letters in takewhile(lambda each: len(set(each)) == 1, zip(*names, strict=False)))
+
+
+def aligned(columns: Sequence[Sequence[str]]) -> list[str]:
+    """The rows of a table on a terminal: the first column to the left, the others to the right."""
+    width = [max(map(len, column)) for column in columns]
+    rows = zip(*columns, strict=True)
+    return [
+        "  ".join([row[0].ljust(width[0]), *(cell.rjust(w) for cell, w in zip(row[1:], width[1:], strict=True))])
+        for row in rows
+    ]
+
+
+def with_table(text: str) -> list[str]:
+    """The lines of a message with a table below it; a line break in a name stays one, as no table line begins there."""
+    return re.split(r"\n(?=  )", text)
 
 
 def conjoined(names: Iterable[object]) -> str:
@@ -64,9 +108,15 @@ def capitalised(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
+def spoken(name: str) -> str:
+    """A parameter's name in a sentence: ``payload.mass`` becomes "payload mass", ``torque_gain.gain`` "torque gain"."""
+    effect, _, parameter = name.replace("_", " ").partition(".")
+    return f"{effect} {parameter}".strip() if effect.split()[-1:] != [parameter] else effect
+
+
 def in_words(name: str) -> str:
     """A parameter's name as a heading: ``viscous_friction`` becomes "Viscous friction"."""
-    return capitalised(name.replace("_", " ").replace(".", ": "))
+    return capitalised(spoken(name))
 
 
 def pretty_unit(unit: str) -> str:

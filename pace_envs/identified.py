@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from pace_actuators import IdentifiedDrives, PaceDCMotorCfg, match_names, resolve_joint_values
-from pace_actuators.drive_result import CURE
+from pace_actuators.drive_result import ALL, CURE
 from pace_actuators.effects import effect_cfgs
 from pace_actuators.identified import DRIVE_FIELDS
 from pace_actuators.representable import HERE, check_representable
-from pace_actuators.text import listed, plural
+from pace_actuators.text import listed, plural, spoken
 from pace_envs import mdp
 from pace_envs.articulation_cfg import ArticulationCfg
 from pace_envs.manager_based_env import ManagerBasedEnvCfg
@@ -100,8 +100,8 @@ def doubts(cfg: ManagerBasedEnvCfg, identified: IdentifiedDrives | str | Path) -
     found = doubts_of_fit(drives)
     if drives.undetermined:
         found.append(
-            f"{listed(sorted(drives.undetermined), _MOST)} was not determined by the recordings and keeps its prior. "
-            "Record a motion that shows it. [W24]"
+            f"{listed(map(_named, sorted(drives.undetermined)), _MOST)} was not determined by the recordings and keeps "
+            "its prior. Record a motion that shows it. [W24]"
         )
     return found + _other_drives(cfg.scene.robot, drives)
 
@@ -116,10 +116,16 @@ def doubts_of_fit(drives: IdentifiedDrives) -> list[str]:
         )
     if drives.at_bound:
         found.append(
-            f"{listed(drives.at_bound, _MOST)} ended at a bound of the fit, so the value is the bound's. "
+            f"{listed(map(_named, drives.at_bound), _MOST)} ended at a bound of the fit, so the value is the bound's. "
             f"{'Find the missing physics' if far else 'Widen bounds and fit again'}. [W23]"
         )
     return found
+
+
+def _named(label: str) -> str:
+    """``payload.mass/wrist`` as "payload mass of wrist"."""
+    name, _, key = label.partition("/")
+    return spoken(name) if key == ALL else f"{spoken(name)} of {key}"
 
 
 def load_identified_cfg(drives: IdentifiedDrives) -> Any:

@@ -83,8 +83,8 @@ def gaussian(init_std: float) -> dict[str, Any]:
 class RslRlOnPolicyRunnerCfg:
     """Configuration of rsl-rl's ``OnPolicyRunner``."""
 
-    experiment_name: str = "velocity"
-    """Name of the folder of the runs."""
+    experiment_name: str = ""
+    """Name of the folder of the runs; empty: the task's."""
 
     seed: int = 42
     """Seed of the environment and of the networks."""

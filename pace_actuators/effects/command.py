@@ -235,9 +235,11 @@ class DerivativeGain(Effect):
 
 @register_effect
 class GravityCompensation(Effect):
-    """The drive feeds a part of gravity's torque forward, which the recording does not say: τ - c τ_g.
+    """The drive feeds a part of the load's torque forward, which the recording does not say: τ - c τ_g.
 
-    τ_g is the torque of gravity and load on the joint, which pulls the other way than what holds it.
+    τ_g is the torque of weight, Coriolis and centrifugal forces of the model's links on the joint: MuJoCo's
+    ``-qfrc_bias``, the torque at zero acceleration. It has no inertia times acceleration and no springs. The torque
+    that holds the joint has the other sign.
     """
 
     name = "gravity_compensation"
@@ -245,7 +247,7 @@ class GravityCompensation(Effect):
     parameters = (
         EffectParameter(name="share", unit="1", lower=-0.5, upper=2.0, null=0.0, start=0.1, plausible=(0.0, 1.5)),
     )
-    equation = "τ - c τ_g, τ_g the torque of gravity and load on the joint"
+    equation = "τ - c τ_g, τ_g the torque of weight, Coriolis and centrifugal forces on the joint (no accelerations)"
     part = "the controller's gravity feed-forward"
     looks = "the joint leans less than its load and gains say; at c = 1 it does not lean at all"
     source = "controllers of robot arms (e.g. Sawyer, Panda), which know their own dynamics"

@@ -35,7 +35,8 @@ class DriveState(Part):
         motor_pos, motor_vel: Position [rad] and speed [rad/s] of the motor at the joint; other than the joint's where
             the transmission gives way.
         motor_effort: The motor's torque [N m]; ``effort`` may be split up between a torque and a friction.
-        load_effort: Torque of gravity and load on the joint [N m]; zero where the simulator does not give it.
+        load_effort: Torque of weight, Coriolis and centrifugal forces on the joint [N m]; zero where the simulator does
+            not give it.
         load_stiffness: How fast gravity pulls back with the angle [N m/rad]; zero where it is not given.
         link_inertia: Inertia of what the joint carries [kg m²]; zero where it is not given.
         spare_inertia: What may be taken from the joint's inertia beyond the armature [kg m²].

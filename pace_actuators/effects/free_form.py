@@ -214,7 +214,7 @@ class FrictionOverLoad(FreeForm):
     variable = "load on the gear"
     kind = "friction"
     parameters = parameters_of_curve(knots, zero, (1e-3, 5.0, 300.0), "N m")
-    equation = "F = F_c + f(|τ - τ_g|), f(0) = 0, τ_g the torque of gravity and load on the joint"
+    equation = "F = F_c + f(|τ - τ_g|), f(0) = 0, τ_g as for gravity_compensation"
     looks = "the hysteresis loop is wider at some loads than at others"
     reads_load = True
     separates = "recordings at two loads"

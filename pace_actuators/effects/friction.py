@@ -77,7 +77,7 @@ class LoadDependentFriction(Effect):
     parameters = (
         EffectParameter(name="coefficient", unit="1", lower=0.0, upper=0.5, null=0.0, start=0.01, meaning="k_l"),
     )
-    equation = "F = F_c + k_l |τ - τ_g|, τ_g the torque of gravity and load on the joint"
+    equation = "F = F_c + k_l |τ - τ_g|, τ_g as for gravity_compensation"
     part = "the gear: worm, harmonic or planetary"
     looks = "the hysteresis loop widens with the load"
     source = "Duclusaud et al., BAM (Rhoban), model M3"

@@ -15,6 +15,7 @@ import numpy as np
 
 from pace_actuators import PaceDCMotorCfg, resolve_joint_values
 from pace_actuators.base_parameters import PER_JOINT
+from pace_actuators.joint_units import units_for
 from pace_actuators.text import listed
 from pace_envs.articulation_cfg import ArticulationCfg, InitialStateCfg
 from pace_envs.from_model import defaults
@@ -296,9 +297,10 @@ def _assumptions(joints: Sequence[JointFacts], key: str, model: mujoco.MjModel, 
     if without:
         notes.append(f"effort limit: none ({listed(without, 3)})")
     if limits := [joint.effort_limit for joint in joints if np.isfinite(joint.effort_limit)]:
+        unit = units_for("N m", ["slide" if joint.is_slide else "hinge" for joint in joints])
         span = f"{min(limits):g}" if min(limits) == max(limits) else f"{min(limits):g} to {max(limits):g}"
         notes.append(
-            f"effort limit: {span} N m (slides: N), the file's; it cuts the torques. If it is a guess, state "
+            f"effort limit: {span} {unit}, the file's; it cuts the torques. If it is a guess, state "
             "effort_limit beside the log, or find it with --unknown effort_limit"
         )
     if not any(np.isfinite(joint.velocity_limit) for joint in joints):

@@ -85,9 +85,14 @@ class RunSettings:
         return content
 
 
-def new_run_folder(log_dir: str | Path, experiment_name: str) -> Path:
-    """Create ``<log_dir>/<experiment_name>/<YY_MM_DD_HH-MM-SS>``; a number is added where that exists."""
-    base = Path(log_dir) / experiment_name / datetime.now().strftime("%y_%m_%d_%H-%M-%S")
+def new_run_folder(log_dir: str | Path, experiment: str) -> Path:
+    """Create ``<log_dir>/<experiment>/<YY_MM_DD_HH-MM-SS>``; a number is added where that exists.
+
+    Args:
+        experiment: A name, or a task: of ``my_module:My-Walk-v0`` the name.
+    """
+    name = re.sub(r"[^\w.-]+", "_", experiment.rpartition(":")[2])
+    base = Path(log_dir) / name / datetime.now().strftime("%y_%m_%d_%H-%M-%S")
     for number in range(1, 1000):
         folder = base if number == 1 else base.with_name(f"{base.name}_{number}")
         try:

@@ -131,7 +131,7 @@ def train(settings: RunSettings, edit: EditCfg | None = None) -> Path | None:
     start = None if settings.start_from is None else find_checkpoint(settings.start_from)
 
     def begin() -> Path:
-        folder = new_run_folder(settings.log_dir, cfg.runner.experiment_name)
+        folder = new_run_folder(settings.log_dir, cfg.runner.experiment_name or settings.task)
         settings.write(folder, EnvironmentRecord.of(settings.task, cfg).to_dict())
         if settings.identified is not None:
             shutil.copyfile(result_path(settings.identified), folder / IDENTIFIED_FILE)

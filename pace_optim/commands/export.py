@@ -31,7 +31,8 @@ def main() -> None:
         print(*exported.text.split("\n"), sep="\n", end="")
     else:
         exported.write(output)
-    for note in exported.notes:  # after the text on standard output, they go where they do not mix with it
-        print(f"note: {note}", file=sys.stdout if output else sys.stderr)
+    said = [*(f"warning: {each}" for each in exported.warnings), *(f"note: {each}" for each in exported.notes)]
+    for line in said:  # after the text on standard output, they go where they do not mix with it
+        print(line, file=sys.stdout if output else sys.stderr)
     if output is not None:
         print(f"written: {output}")

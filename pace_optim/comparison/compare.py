@@ -13,10 +13,11 @@ import numpy as np
 
 from pace_actuators.files import write_together
 from pace_actuators.joint_units import joint_label, units_for
-from pace_actuators.text import listed, percent, position_unit, shortened, three_figures
+from pace_actuators.text import aligned, in_short, listed, percent, position_unit, shortened, three_figures
 from pace_optim.recording.noise import noise_floor
 from pace_optim.report import check_folder, report_text
 from pace_optim.run.open import run_folder
+from pace_optim.run.summary import carried_by
 from pace_optim.run.tensors import held_out_spans
 
 from .error_regions import AT_THE_FLOOR, NEGLIGIBLE, worst_places
@@ -95,7 +96,7 @@ def compare_run(run: RunTracks) -> dict[str, Any]:
         "physics_dt": run.physics_dt,
         "data": list(run.data),
         "joint_names": list(joints),
-        "summary": _summary(compared),
+        "summary": " ".join(filter(None, [_summary(compared), _carried(joints, compared)])),
         "worst_places": [place_content(place) for place in worst],
         "rmse": rmse_by_part(run.tracks),
         "noise_floor": float(np.sqrt(np.mean(np.square(floors)))),
@@ -155,6 +156,15 @@ def _summary(compared: Sequence[JointComparison]) -> str:
     return text
 
 
+def _carried(joints: Sequence[str], compared: Sequence[JointComparison]) -> str:
+    """Which few joints hold nearly all error above the noise; "" where many do, or all are explained."""
+    left = {
+        joint: 0.0 if _explained(own.content) else max(own.content["rmse"].values())
+        for joint, own in zip(joints, compared, strict=True)
+    }
+    return carried_by(left)
+
+
 def _explained(content: dict[str, Any]) -> bool:
     rmse = content["noise_floor"] / max(1 - content["share_above_floor"], 1e-12) ** 0.5
     return rmse <= AT_THE_FLOOR * content["noise_floor"] or max(content["rmse"].values()) < NEGLIGIBLE
@@ -187,17 +197,21 @@ def comparison_lines(content: dict[str, Any]) -> list[str]:
     factor, unit = position_unit(values, ["hinge"])
     types = [joint["type"] for joint in joints.values()]
     labels = [joint_label(name, own, types, unit) for name, own in zip(joints, types, strict=True)]
-    width = max(5, *(len(label) for label in labels))
-    head = f"{'joint':{width}}" + "".join(f"  {part:>10}" for part in parts) + f"  {'noise':>10}  above noise"
+    names, pattern = in_short(labels)
+    columns = [[f"joint {pattern}".strip(), *names]]
+    columns += [[part, *(_cell(j["rmse"].get(part), factor) for j in joints.values())] for part in parts]
+    columns += [["noise", *(_cell(joint["noise_floor"], factor) for joint in joints.values())]]
+    columns += [["above noise", *(percent(joint["share_above_floor"]) for joint in joints.values())]]
+    head, *rows = aligned(columns)
     lines = [f"{head}   [{units_for(unit, types)}]"]
-    for label, joint in zip(labels, joints.values(), strict=True):
-        cells = "".join(_cell(joint["rmse"].get(part), factor) for part in parts)
-        share = percent(joint["share_above_floor"])
-        lines.append(f"{label:{width}}{cells}{_cell(joint['noise_floor'], factor)}  {share:>11}")
+    for name, row in zip(joints, rows, strict=True):
+        own = [
+            place["sentence"].removeprefix(f"{name}: ") for place in content["worst_places"] if place["joint"] == name
+        ]
+        lines += [row, *(f"    {sentence}" for sentence in own)]
     lines += _split(content, factor, "recording", [each["name"] for each in content["recordings"]])
     lines += _split(content, factor, "drive", ["off", "on"])
     lines += ["", content["summary"]]
-    lines += [f"  {place['sentence']}" for place in content["worst_places"]]
     if "ladder" in content:
         lines += ["", *ladder_table(content["ladder"], types)]
     return lines + [f"note: {note}" for note in shortened(content["notes"], "note")]
@@ -212,15 +226,15 @@ def _split(content: dict[str, Any], factor: float, name: str, labels: Sequence[s
     found = {joint: one["where"][name]["rms"] for joint, one in content["joints"].items() if name in one["where"]}
     if not found:
         return []
-    width = max(len(name), *(len(label) for label in labels))
-    lines = ["", f"{name:{width}}  {'all joints':>10}  {'largest':>10}"]
+    rows = [[name, "all joints", "largest", ""]]
     for i, label in enumerate(labels):
         values = {joint: rms[i] for joint, rms in found.items()}
         worst = max(values, key=lambda joint: values[joint])
         whole = math.sqrt(sum(value**2 for value in values.values()) / len(values))
-        lines.append(f"{label:{width}}{_cell(whole, factor)}{_cell(values[worst], factor)}  {worst}")
-    return lines
+        rows.append([label, _cell(whole, factor), _cell(values[worst], factor), worst])
+    *numbers, worst_joints = zip(*rows, strict=True)
+    return ["", *(f"{row}  {joint}".rstrip() for row, joint in zip(aligned(numbers), worst_joints, strict=True))]
 
 
 def _cell(value: float | None, factor: float) -> str:
-    return f"  {'–' if value is None else three_figures(factor * value):>10}"
+    return "–" if value is None else three_figures(factor * value)

@@ -126,7 +126,8 @@ def find_wrong_links(
         return LinkFindings()
     now, found, joint_of = base, tuple[Reference, ...](), None
     while len(found) < own.most and now.rmse > alike * noise:
-        say(f"screening the links of the model file ({len(found)} found to be wrong)")
+        beside = f" beside {', '.join(each.link for each in found)}" if found else ""
+        say(f"looking for wrong masses in the model file{beside}")
         screened = _screened(now, found, cfg)
         joint_of = screened.joint_of if joint_of is None else joint_of
         best = _best_addition(now, found, screened, noise, say, cfg)
@@ -210,7 +211,7 @@ def _best_addition(
             break
         sought = (*(each for each in found if each.link != addition.link), addition)
         names = [f"{each.link} ({plural(len(each.names), 'parameter')})" for each in sought]
-        say(f"fitting the links {', '.join(names)}")
+        say(f"trying other masses of {', '.join(names)}")
         values = _values_of(now) | screened.loads.get(addition.link, {})
         fitted.append((len(addition.names), _fit(problem.seeking(sought), values, cfg.links)))
     if not fitted:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from pace_actuators import IdentifiedDrives
@@ -28,7 +28,10 @@ class Export:
     """The file's content."""
 
     notes: list[str]
-    """Why the fit's values may not be the robot's, and what the format cannot hold."""
+    """What the format cannot hold, and what to do where it is used."""
+
+    warnings: list[str] = field(default_factory=list)
+    """Why the fit's values may not be the robot's: W22 and W23, as a training prints them."""
 
     def write(self, path: str | Path) -> None:
         """Write the file, whole or not at all."""
@@ -97,7 +100,7 @@ def export(path: str | Path, fmt: str, *, joints_only: bool = False, task: str |
     text, notes = mjcf(drives, joints_only=True) if joints_only else FORMATS[fmt](drives)
     if fmt in _OF_JOINTS:
         notes = [*notes, *pulled_notes(drives)]
-    return Export(text=text, notes=[*doubts_of_fit(drives), *_short_step(drives), *notes])
+    return Export(text=text, notes=[*_short_step(drives), *notes], warnings=doubts_of_fit(drives))
 
 
 def _short_step(drives: IdentifiedDrives) -> list[str]:

@@ -220,7 +220,7 @@ def _reached(run: Optimization, outcome: Outcome) -> _End:
 def _with_loop_rate(run: Optimization, end: _End) -> _End:
     """Add what depends on an assumed loop rate; take another rate where only others fit."""
     if end.problem.assumes_loop_rate:
-        run.progress.say("simulating other rates of the drives' loops, as theirs is not stated")
+        run.progress.say("simulating other loop rates of the drives, as none is stated (--drive_dt)")
     rates = loop_rates(end.problem, end.x, end.jacobian, end.known, end.at.phases)
     if rates is None:
         return end

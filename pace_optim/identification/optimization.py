@@ -298,7 +298,7 @@ class Optimization:
             if period == problem.loop_dt or least.score <= _IN_DOUBT**2 * noise:
                 continue
             rate = f"at {1e-3 / period:g} kHz" if period else "continuously"
-            self.progress.say(f"error above the noise: fitting drive loops that run {rate}, as none is stated")
+            self.progress.say(f"above the noise: fitting drive loops that run {rate}, as none is stated (--drive_dt)")
             other = self._way(problem.with_loop(period), f"loop of {period:g} s")
             there = there or self._derivatives(best)
             start = self._by_known_derivatives(other, best, there)
@@ -489,8 +489,8 @@ class Optimization:
         history.search_time_s.append(self.progress.elapsed)
         self.log.log_generation(optimizer)
         spread = float(optimizer.spread.max())
-        error = self._in_words(optimizer.best_score)
-        self.progress.show(self._search_name, optimizer.generation, cfg.max_iteration, error, spread, self.steps)
+        best = f"best candidate {self._in_words(optimizer.best_score).removeprefix('error ')}"
+        self.progress.show(self._search_name, optimizer.generation, cfg.max_iteration, best, spread, self.steps)
         self._keep_process(optimizer)
         if optimizer.generation % cfg.save_interval == 0:
             self._write_mean(optimizer)
@@ -518,7 +518,10 @@ class Optimization:
             self.log.log_refinement(now.iteration, best)
         name = "fit on pieces" if on_pieces else "fit on whole recordings"
         name += f" from start {number}" if number > 1 else ""
-        self.progress.show(name, now.iteration, cfg.max_iteration, self._in_words(now.score), None, self.steps)
+        error = self._in_words(now.score)
+        if on_pieces:  # they begin where the robot was, so their error is smaller than that of recordings
+            error = error.replace("error", "error of pieces", 1)
+        self.progress.show(name, now.iteration, cfg.max_iteration, error, None, self.steps)
         self.folder.write_mean(self.history.iterations, self.problem.space.to_physical(self._best_so_far()))
         self._write_checkpoint()
 

@@ -294,24 +294,42 @@ def with_shared_facts(
 
 
 def unused_facts(paths: Sequence[str | os.PathLike[str]], facts: str | os.PathLike[str] | None = None) -> str:
-    """Which JSON file of gains lies beside recordings and is of none of them, and what to do; "" if none does.
+    """Which JSON file beside recordings states gains that are stated nowhere else, and what to do; "" if none does.
 
     Args:
         facts: The file that is given for all recordings.
     """
     used = {Path(path).with_suffix(".json").resolve() for path in paths} | ({Path(facts).resolve()} if facts else set())
     folders = dict.fromkeys(Path(path).parent for path in paths)
+    shared = _drive_facts(Path(facts)) if facts else {}
+    stated = [{**shared, **_drive_facts(Path(path).with_suffix(".json"))} for path in paths]
     for path in (each for folder in folders if folder.is_dir() for each in sorted(folder.glob("*.json"))):
         of_another = any(path.with_suffix(suffix).exists() for suffix in (*SUFFIXES, ""))
-        if path.resolve() in used or of_another or path.stat().st_size > _LARGEST_FACTS:
+        if path.resolve() in used or of_another:
             continue
-        try:
-            content = parsed_json(path.read_text(encoding="utf-8-sig"))
-        except (ValueError, OSError, RecursionError):
-            continue
-        if isinstance(content, dict) and {"stiffness", "damping", "effort_limit"} & {as_fact(key) for key in content}:
+        content = _drive_facts(path)
+        if content and not all(_state(own, content) for own in stated):
             return f"{path} is not used. If it holds the gains of these logs: --facts {shlex.quote(str(path))}"
     return ""
+
+
+def _drive_facts(path: Path) -> dict[str, Any]:
+    """Gains and effort limits that a JSON file states; none where it is missing, or another file."""
+    try:
+        content = parsed_json(path.read_text("utf-8-sig")) if path.stat().st_size <= _LARGEST_FACTS else None
+    except (ValueError, OSError, RecursionError):
+        return {}
+    named = {as_fact(key): value for key, value in content.items()} if isinstance(content, dict) else {}
+    return {key: named[key] for key in ("stiffness", "damping", "effort_limit") if key in named}
+
+
+def _state(stated: Mapping[str, Any], others: Mapping[str, Any]) -> bool:
+    """Whether facts hold all that other facts hold, of all their joints."""
+    joints = [(stated.get(key), value) for key, value in others.items()]
+    return all(
+        own is not None if not isinstance(own, Mapping) else isinstance(value, Mapping) and value.keys() <= own.keys()
+        for own, value in joints
+    )
 
 
 _LARGEST_FACTS = 1 << 20

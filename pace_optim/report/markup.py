@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
 import json
 import math
 from collections.abc import Iterable, Sequence
@@ -9,8 +11,11 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
+
+from pace_actuators.text import in_short
 
 ENVIRONMENT = Environment(
     autoescape=True,
@@ -113,19 +118,21 @@ def log_step(values: Iterable[float | None]) -> float | str:
 
 
 def choice(name: str, entries: Sequence[str], group: str = "", at: int = 0) -> Markup:
-    """Radio buttons that look like pills: arrow keys go from one to the next.
+    """Radio buttons that look like pills: arrow keys go from one to the next. What all names share stands before them.
 
     Args:
         group: Sets them apart from another choice of the same on the page.
         at: Which one the page opens on.
     """
+    shown, pattern = in_short(entries)
     return html(
         '<div class="pills" role="radiogroup" aria-label="{{ name }}" data-choice="{{ name }}"{{ hidden }}>'
-        "<b>{{ name.capitalize() }}</b><div>{% for entry in entries %}"
+        "<b>{{ name.capitalize() }}{% if pattern %}<br>{{ pattern }}{% endif %}</b><div>{% for entry in entries %}"
         '<label><input type="radio" name="{{ group + name }}" value="{{ loop.index0 }}"'
         '{{ " checked" if loop.index0 == at }}><span>{{ entry }}</span></label>{% endfor %}</div></div>',
         name=name,
-        entries=entries,
+        entries=shown,
+        pattern=pattern,
         group=group,
         at=at,
         hidden=" hidden" if len(entries) == 1 and name == "recording" else "",
@@ -134,9 +141,32 @@ def choice(name: str, entries: Sequence[str], group: str = "", at: int = 0) -> M
 
 def json_script(content: Any) -> Markup:
     """Data for the page's script; numbers that JSON does not have become ``null``."""
-    text = json.dumps(_finite(content), separators=(",", ":"), allow_nan=False)
-    text = text.replace("<", "\\u003c")  # so that no text in it can close the script
-    return Markup(f'<script type="application/json">{text}</script>')
+    return packed_script(json.dumps(_finite(content), separators=(",", ":"), allow_nan=False), "application/json")
+
+
+def packed_script(text: str, kind: str) -> Markup:
+    """A script that ``unpack.js`` unpacks, a third of its size; no text in it can close it."""
+    packed = base64.b64encode(gzip.compress(text.encode(), mtime=0)).decode()
+    return Markup(f'<script type="text/plain" data-packed="{kind}">{packed}</script>')
+
+
+def curve(values: np.ndarray, step: float) -> dict[str, Any]:
+    """A curve for the page's script: rounded to whole steps, each as the difference from the one before.
+
+    Args:
+        values: (K,); what is not finite becomes ``null``.
+    """
+    values = np.asarray(values, dtype=float)
+    known = np.isfinite(values)
+    by: list[int | None] = [None] * len(values)
+    steps = np.rint(np.clip(values[known] / step, -_MOST_STEPS, _MOST_STEPS)).astype(np.int64)
+    for place, difference in zip(np.flatnonzero(known).tolist(), np.diff(steps, prepend=0).tolist(), strict=True):
+        by[place] = difference
+    return {"step": step, "by": by}
+
+
+_MOST_STEPS = 2.0**50
+"""Whole numbers that JavaScript holds exactly; a simulation that diverged goes further."""
 
 
 def _finite(content: Any) -> Any:

@@ -11,7 +11,7 @@ from plotly.offline import get_plotlyjs
 
 from pace_actuators.files import write_atomically
 
-from .markup import ENVIRONMENT, Section
+from .markup import ENVIRONMENT, Section, packed_script
 from .run_data import RunData
 from .sections import SECTIONS
 from .sections.replay import replay
@@ -91,7 +91,7 @@ def make_sections(run: RunData) -> list[Section]:
 def render(run: RunData, sections: list[Section], *, figures: bool = True) -> str:
     """The page's HTML; without ``figures`` it is smaller, as it does not hold plotly."""
     here = files(__package__)
-    texts = [get_plotlyjs(), here.joinpath("script.js").read_text("utf-8")] if figures else []
+    texts = [here.joinpath("script.js").read_text("utf-8")] if figures else []
     texts.append(here.joinpath("motion", "viewer.js").read_text("utf-8"))
     return ENVIRONMENT.get_template("page.html").render(
         policy=_POLICY,
@@ -99,5 +99,6 @@ def render(run: RunData, sections: list[Section], *, figures: bool = True) -> st
         folder=run.folder.resolve().name,
         style=here.joinpath("style.css").read_text("utf-8"),
         sections=sections,
-        scripts=texts,
+        plotly=packed_script(get_plotlyjs(), "text/javascript") if figures else "",
+        scripts=[here.joinpath("unpack.js").read_text("utf-8"), *texts],
     )

@@ -1,6 +1,6 @@
 "use strict";
 // Draws what the page holds: figures as plotly specifications, and the trajectories to choose from.
-(() => {
+pace.ready.then(() => {
   const CONFIG = {
     responsive: true, displaylogo: false, doubleClick: "reset", toImageButtonOptions: { scale: 2 },
     modeBarButtons: [["toImage"], ["zoom2d", "pan2d"], ["resetScale2d"]],
@@ -93,11 +93,6 @@
     };
   }
 
-  function decode(text, Type) {
-    const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
-    return new Type(bytes.buffer);
-  }
-
   function makeExplorer(element) {
     const content = read(element), canvas = element.querySelector(".canvas");
     const chosen = (name) => Number(element.querySelector(`[data-choice="${name}"] input:checked`).value);
@@ -107,15 +102,12 @@
 
     function draw() {
       const recording = content.recordings[chosen("recording")], curve = recording.joints[chosen("joint")];
-      const time = decode(recording.time, Float32Array);
-      const x = curve.sample === null ? time : decode(curve.sample, Uint32Array).reduce((kept, sample, i) => {
-        kept[i] = time[sample];
-        return kept;
-      }, new Float32Array(decode(curve.sample, Uint32Array).length));
+      const time = pace.curve(recording.time);
+      const x = curve.sample === null ? time : pace.curve(curve.sample).map((sample) => time[sample]);
       const shown = { hovertemplate: `%{y:.4f} ${curve.position_unit}` };
-      const measured = decode(curve.measured, Float32Array), error = decode(curve.error, Float32Array);
+      const measured = pace.curve(curve.measured), error = pace.curve(curve.error);
       const data = [
-        line("target", x, decode(curve.target, Float32Array), "var(--target)", { width: 1.2 }, shown),
+        line("target", x, pace.curve(curve.target), "var(--target)", { width: 1.2 }, shown),
         line("measured", x, measured, "var(--measured)", { width: 2 }, shown),
         line("simulated", x, measured.map((value, i) => value + error[i]), "var(--simulated)", { dash: "5px,2px" }, shown),
         {
@@ -197,4 +189,4 @@
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawAll);
   matchMedia("(max-width: 640px)").addEventListener("change", drawAll);
   drawAll();
-})();
+});

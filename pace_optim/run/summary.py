@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
 
 from pace_actuators.drive_result import ALL
 from pace_actuators.joint_units import JOINT_TYPES, JointType, units_for
-from pace_actuators.text import shortened
+from pace_actuators.text import aligned, conjoined, in_short, percent, shortened, with_table
 from pace_optim.run.result import FitResult
 from pace_optim.terminal.cli import command
 
 ABOVE_NOISE = 1.5
 """Times the noise above which an error has causes beside it."""
+_NEARLY_ALL = 0.9
+"""Part of the squared error that a few joints hold where the others need no look."""
 _FEW = 6
 """Values of an effect that a line shows; curves have more."""
 
 
 def summary(result: FitResult) -> list[str]:
     """The table of parameters with error bars, the errors and the three first warnings, a line each."""
-    width = max(len(joint) for joint in [*result.joint_names, "joint"])
     lines: list[str] = []
     for joint_type in JOINT_TYPES:
         joints = [joint for joint in result.joint_names if result.joint_type(joint) == joint_type]
         base = [name for name in result.joint_parameters if "." not in name]
-        lines += _table(result, base, joints, joint_type, width)
+        lines += _table(result, base, joints, joint_type)
     lines += _effects(result)
     lines += _links(result)
     for name, values in result.parameters.items():
@@ -40,6 +42,8 @@ def summary(result: FitResult) -> list[str]:
     if result.times_noise and not result.std_means_nothing:
         said = above_noise(result) or f"{result.times_noise:.3g} times the measurement noise"
         lines.append(f"training error: {said}")
+    if few := few_joints(result):
+        lines.append(few)
     if result.torque_noise:
         lines.append(f"error of torques: {', '.join(_torque_errors(result))} (train / validation)")
     if result.objective:
@@ -50,7 +54,8 @@ def summary(result: FitResult) -> list[str]:
         f"stopped: {'; '.join(result.stop_reasons)}"
     )
     lines += [f"note: {finding}" for finding in result.findings]
-    lines += [f"warning: {warning}" for warning in shortened(result.warnings, "warning")]
+    for warning in shortened(result.warnings, "warning"):
+        lines += with_table(f"warning: {warning}")
     return lines + ["meaning and cure of each code: docs/faq.md"] * any("[W" in warning for warning in result.warnings)
 
 
@@ -58,6 +63,29 @@ def above_noise(result: FitResult) -> str:
     """How far above the noise a fit has ended, where something is missing; else empty."""
     times = result.times_noise or 0.0
     return f"{times:.3g} times the measurement noise: something is missing" if times >= ABOVE_NOISE else ""
+
+
+def few_joints(result: FitResult) -> str:
+    """Which few joints hold nearly all of an error above the noise, in training or held out; else ""."""
+    train, held_out = result.rmse["train"], result.rmse.get("validation", {})
+    errors = {joint: max(error or 0.0, held_out.get(joint) or 0.0) for joint, error in train.items()}
+    return carried_by(errors) if (result.times_noise or 0.0) >= ABOVE_NOISE else ""
+
+
+def carried_by(errors: Mapping[str, float | None]) -> str:
+    """Which few joints hold nearly all of the squared error, in a sentence; "" where many do.
+
+    Args:
+        errors: RMSE by joint.
+    """
+    squares = {joint: error**2 for joint, error in errors.items() if joint != ALL and error is not None}
+    order, total = sorted(squares, key=squares.__getitem__, reverse=True), sum(squares.values())
+    for count in range(1, len(order) // 3 + 1):
+        share = sum(squares[joint] for joint in order[:count]) / total if total else 0.0
+        if share >= _NEARLY_ALL:
+            first = [joint for joint in squares if joint in order[:count]]
+            return f"{conjoined(first)} hold{'s' if count == 1 else ''} {percent(share)} of the squared error."
+    return ""
 
 
 def error_line(result: FitResult, of: str = "error, all joints") -> str:
@@ -92,7 +120,7 @@ def _torque_errors(result: FitResult) -> list[str]:
     ]
 
 
-def _table(result: FitResult, names: list[str], joints: list[str], joint_type: JointType, width: int) -> list[str]:
+def _table(result: FitResult, names: list[str], joints: list[str], joint_type: JointType) -> list[str]:
     """The joints of one type, a line each, under a head with their units."""
     if not joints:
         return []
@@ -101,9 +129,8 @@ def _table(result: FitResult, names: list[str], joints: list[str], joint_type: J
     columns = [[f"{name} [{unit[name]}]", *(_value(result, name, joint) for joint in joints)] for name in names]
     head = units_for("train / validation [mrad]", [joint_type])
     columns.append([head, *(errors_of(result, joint) for joint in joints)])
-    aligned = [[cell.rjust(max(map(len, column))) for cell in column] for column in columns]
-    rows = zip([name.ljust(width) for name in ("joint", *joints)], *aligned, strict=True)
-    return [*("  ".join(row) for row in rows), ""]
+    names_shown, pattern = in_short(joints)
+    return [*aligned([[f"joint {pattern}".strip(), *names_shown], *columns]), ""]
 
 
 def _effects(result: FitResult) -> list[str]:
@@ -116,8 +143,12 @@ def _effects(result: FitResult) -> list[str]:
             rows.setdefault((effect, joint), []).append(text)
     if not rows:
         return []
-    cells = [(*key, ", ".join(v) if len(v) <= _FEW else f"{len(v)} values: see the report") for key, v in rows.items()]
-    table = [("effect", "joint", "values"), *cells]
+    short, pattern = in_short(result.joint_names)
+    shown = dict(zip(result.joint_names, short, strict=True))
+    table = [("effect", f"joint {pattern}".strip(), "values")]
+    for (effect, joint), own in rows.items():
+        values = ", ".join(own) if len(own) <= _FEW else f"{len(own)} values: see the report"
+        table.append((effect, shown.get(joint, joint), values))
     first, second = (max(len(row[i]) for row in table) for i in (0, 1))
     return [*(f"{effect:<{first}}  {joint:<{second}}  {values}" for effect, joint, values in table), ""]
 

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import sys
 import threading
 import time
+from collections.abc import Mapping
 from typing import ClassVar, TextIO
 
+from pace_actuators.text import with_table
+
 _TIMES = 3
-"""Times that a line shows, at most, before it is written anew."""
+"""Times that a counter's line shows, at most, before it is written anew."""
+_MOST_TIMES = 8
+"""Times on a line whose text stays."""
+_LEAST_LEFT = 5.0
+"""Less time left is not stated [s]."""
 
 
 class ProgressLine:
     """Shows what runs and for how long.
 
     On a terminal one line is overwritten every second. Elsewhere a step has a line when it begins, and the time is
-    added to that line every ten seconds; every third time the line is written anew, with the counter.
+    added to that line every ten seconds. A counter that has moved is written every third time.
     """
 
     last_written: ClassVar[ProgressLine | None] = None
@@ -28,7 +36,9 @@ class ProgressLine:
         self._live = self._stream.isatty()
         self._between = seconds_between_times
         self._lock = threading.Lock()
-        self._running, self._step, self._shown_step, self._open = "", "", "", False
+        self._running, self._step, self._shown, self._shown_step, self._open = "", "", "", "", False
+        self._shares: dict[str, float] = {}
+        self._share, self._share_began = 0.0, 0.0
         self._closed: threading.Event | None = None
         self._began, self._last, self._times = time.perf_counter(), 0.0, 0
         self.restart()
@@ -38,6 +48,28 @@ class ProgressLine:
         self._start = time.perf_counter()
         self._phase = ""
         self._phase_began = self._latest = (0.0, 0)
+
+    def expect(self, shares: Mapping[str, float]) -> None:
+        """State the time left from now on.
+
+        Args:
+            shares: Part of the whole time that has usually passed where a step begins, by how its text begins (a
+                regular expression; the first that fits counts).
+        """
+        self._shares = dict(shares)
+
+    @property
+    def left(self) -> float | None:
+        """Time left [s], from how late the present step began and is; ``None`` if not known.
+
+        A step that takes longer than usual goes on for as long as it has run, and the others are longer too.
+        """
+        if not self._share:
+            return None
+        later = min((share for share in self._shares.values() if share > self._share), default=1.0)
+        passed = self.shown - self._share_began
+        of_step = max(self._share_began * (later / self._share - 1.0) - passed, passed)
+        return of_step + (self.shown + of_step) * (1.0 / later - 1.0)
 
     @property
     def elapsed(self) -> float:
@@ -50,7 +82,7 @@ class ProgressLine:
         return time.perf_counter() - self._began
 
     def show(self, phase: str, done: int, total: int, error: str, spread: float | None, steps: int) -> None:
-        """Update the line. It states no remaining time: when an optimizer converges is not known.
+        """Update the line.
 
         Args:
             done: Iterations so far in this phase.
@@ -85,7 +117,7 @@ class ProgressLine:
     def tell(self, *lines: str) -> None:
         """Show lines that stay."""
         self.end_line()
-        print(*lines, sep="\n", file=self._stream, flush=True)
+        print(*(part for line in lines for part in with_table(line)), sep="\n", file=self._stream, flush=True)
 
     def end_line(self) -> None:
         """End a line that is open, as something else follows."""
@@ -100,10 +132,14 @@ class ProgressLine:
             self._closed.set()
             self._closed = None
         self.end_line()
-        self._shown_step = ""
+        self._shown = self._shown_step = ""
 
     def _run(self, text: str, step: str, now: bool = True) -> None:
         """Show what runs from now on, until the next text or the end; a counter's line waits for its turn."""
+        if step != self._step:
+            share = next((share for begin, share in self._shares.items() if re.match(begin, text)), 0.0)
+            if share > self._share:
+                self._share, self._share_began = share, self.shown
         self._running, self._step = text, step
         if now or self.shown - self._last >= self._between:
             self._write()
@@ -126,17 +162,29 @@ class ProgressLine:
             if self._live:
                 width = shutil.get_terminal_size().columns - 1
                 self._stream.write("\r")
-                self._stream.write((self._running + passed)[:width].ljust(width))
-            elif self._open and self._step == self._shown_step and self._times < _TIMES:
+                self._stream.write((self._running + passed + self._about_left())[:width].ljust(width))
+            elif self._open and self._step == self._shown_step and self._times < self._most_times():
                 self._times += 1
                 self._stream.write(passed)
             else:
-                self._shown_step, self._times = self._step, 1
+                # a text that has been shown goes on below itself
+                text = " " * 4 if self._open and self._running == self._shown else self._running
+                self._shown, self._shown_step, self._times = self._running, self._step, 1
                 if self._open:
                     self._stream.write("\n")
-                self._stream.write(self._running + passed)
+                self._stream.write(text + passed + self._about_left())
             self._open, ProgressLine.last_written = True, self
             self._stream.flush()
+
+    def _most_times(self) -> int:
+        return _MOST_TIMES if self._running == self._shown else _TIMES
+
+    def _about_left(self) -> str:
+        """The time left in words, rounded to 10 s, from 100 s to minutes."""
+        left = self.left
+        if left is None or left < _LEAST_LEFT:
+            return ""
+        return f", about {f'{10 * max(1, round(left / 10))} s' if left < 100 else f'{left / 60:.0f} min'} left"
 
 
 def end_line() -> None:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from pace_actuators.text import conjoined, listed, plural
+from pace_actuators.text import conjoined, in_short, listed, plural
 
 
 @pytest.mark.parametrize(
@@ -25,3 +25,20 @@ def test_names_are_conjoined_as_in_a_sentence():
 
 def test_one_thing_is_singular():
     assert plural(1, "joint") == "1 joint" and plural(0, "joint") == "0 joints"
+
+
+@pytest.mark.parametrize(
+    ("names", "short", "pattern"),
+    [
+        (["lbr_iiwa_joint_1", "lbr_iiwa_joint_2"], ["1", "2"], "lbr_iiwa_joint_…"),
+        (["arm_left_2_joint", "arm_left_wrist_joint"], ["2", "wrist"], "arm_left_…_joint"),
+        (["hip_joint", "knee_joint"], ["hip_joint", "knee_joint"], ""),  # little is shared
+        (["robot_arm", "robot_arm_2"], ["robot_arm", "robot_arm_2"], ""),  # nothing would be left of the first
+        (["LF_HAA", "LF_HFE"], ["LF_HAA", "LF_HFE"], ""),
+        (["only_one_long_name"], ["only_one_long_name"], ""),
+    ],
+)
+def test_names_of_a_table_leave_out_what_all_share(names, short, pattern):
+    assert in_short(names) == (short, pattern)
+    if pattern:
+        assert [pattern.replace("…", each) for each in short] == names

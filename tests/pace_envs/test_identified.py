@@ -503,7 +503,7 @@ def test_a_sound_result_with_the_tasks_gains_raises_no_doubt(result):
     ("changes", "said"),
     [
         ({"times_noise": 55.0}, r"ended at 55 times the measurement noise.*pace diagnose"),
-        ({"at_bound": ["friction/LF_HAA"]}, r"friction/LF_HAA ended at a bound.*Widen bounds"),
+        ({"at_bound": ["friction/LF_HAA"]}, r"friction of LF_HAA ended at a bound.*Widen bounds"),
         ({"undetermined": [f"encoder_bias/{j}" for j in JOINTS]}, r"LF_HAA.*and 8 more was not determined"),
         ({"drive": {"stiffness": {"LF_HAA": 120.0}}}, r"stiffness is 85 in this task and was 120 in the recordings"),
         ({"drive": {"effort_limit": {"LF_KFE": 40.0}}}, r"effort_limit is 89 .* was 40 .*\(LF_KFE\)"),

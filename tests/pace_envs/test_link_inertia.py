@@ -378,7 +378,7 @@ def test_what_one_number_on_a_joint_explains_as_well_is_no_wrong_link(tmp_path):
     x, _ = fit(problem, iterations=4)
     said: list[str] = []
     assert find_wrong_links(problem, problem.space.to_physical(x), said.append) == LinkFindings()
-    assert said == ["screening the links of the model file (0 found to be wrong)"]
+    assert said == ["looking for wrong masses in the model file"]
 
 
 def test_a_diagnosis_names_no_link_of_a_file_that_is_right(tmp_path):

@@ -1,5 +1,7 @@
 """What a report's page says."""
 
+import base64
+import gzip
 import re
 from html.parser import HTMLParser
 
@@ -55,3 +57,9 @@ class Page(HTMLParser):
 
 def page_of(folder) -> Page:
     return Page(write_report(folder).read_text("utf-8"))
+
+
+def contents_of(page: str) -> str:
+    """The data of a page's scripts, unpacked."""
+    packed = re.findall(r'data-packed="application/json">([^<]*)<', page)
+    return "\n".join(gzip.decompress(base64.b64decode(each)).decode() for each in packed)

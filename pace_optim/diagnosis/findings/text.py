@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from pace_actuators.joint_units import units_for
-from pace_actuators.text import SHOWN, conjoined, listed, shortened, sizes_by_joints, three_figures
+from pace_actuators.text import SHOWN, conjoined, listed, shortened, sizes_by_joints, spoken, three_figures
 from pace_optim.diagnosis.findings.result import Diagnosis
 
 _EFFECTS = 8
@@ -38,8 +38,8 @@ def lines_of(diagnosis: Diagnosis) -> list[str]:
 
 
 def size_lines(sizes: Sequence[dict[str, Any]]) -> list[str]:
-    """A line for each value: "  torque_gain.gain of servo: 0.45 ± 0.002 times what was stated"."""
+    """A line for each value: "  torque gain of servo: 0.45 ± 0.002 times what was stated"."""
     return [
-        f"  {effect}.{parameter} of {conjoined(joints)}: {text}"
+        f"  {spoken(f'{effect}.{parameter}')} of {conjoined(joints)}: {text}"
         for (effect, parameter, text), joints in sizes_by_joints(sizes).items()
     ]

@@ -8,8 +8,9 @@ from collections.abc import Iterable, Sequence
 import torch
 
 from pace_actuators.drive_result import ALL
+from pace_actuators.effects import get_effect
 from pace_actuators.joint_units import JointType, units_for
-from pace_actuators.text import conjoined
+from pace_actuators.text import conjoined, spoken
 from pace_envs.link_inertia import NAMES
 from pace_envs.tasks.pace import GLOBAL
 from pace_optim.estimate.error_bars.far_from_noise import FAR_ABOVE_NOISE, times_noise
@@ -116,7 +117,7 @@ def _motions(labels: Iterable[str]) -> str:
 def _named(labels: Sequence[str]) -> str:
     """Parameters with their joints and links, in words."""
     of_joints = [label for label in labels if label.split("/")[0] not in NAMES]
-    named = [f"{name.replace('_', ' ')}{_of(keys)}" for name, keys in _by_parameter(of_joints).items()]
+    named = [f"{spoken(name)}{_of(keys)}" for name, keys in _by_parameter(of_joints).items()]
     return "; ".join([*named, *_of_links(labels)])
 
 
@@ -138,7 +139,7 @@ def _alike(groups: Sequence[tuple[str, ...]]) -> list[str]:
         kind = tuple(label.split("/")[0] for label in group) if len(keys) == 1 else group
         kinds.setdefault(kind, []).extend(sorted(keys) if len(keys) == 1 else [])
     found = [
-        conjoined([name.replace("_", " ") for name in kind]) + _of(keys) if keys else in_words(kind)
+        conjoined([spoken(name) for name in kind]) + _of(keys) if keys else in_words(kind)
         for kind, keys in kinds.items()
     ]
     if not found:
@@ -243,19 +244,35 @@ def _at_bounds(
     space = problem.space
     low, high, values = space.lower.tolist(), space.upper.tolist(), physical.tolist()
     places: dict[tuple[str, str, float], list[str]] = {}
+    open_above: dict[tuple[str, str, float], list[str]] = {}
     for label in uncertainty.at_bound:
         i = space.labels.index(label)
         name, key = label.split("/", 1)
         side, bound = ("lower", low[i]) if values[i] - low[i] < high[i] - values[i] else ("upper", high[i])
-        places.setdefault((name, side, bound), []).append(key)
-    if not places:
-        return []
-    found = [
-        f"{name.replace('_', ' ')} ({side}, {_bound(problem, name, bound, keys[0])}){_of(keys)}"
+        found = open_above if side == "upper" and _has_no_effect_above(name) else places
+        found.setdefault((name, side, bound), []).append(key)
+    or_widen = "" if _is_far(problem, rmse) else ", or widen the bound"
+    lists = ["; ".join(_in_words(problem, own)) for own in (places, open_above)]
+    cures = (
+        f"Find the missing physics that the value stands in for{or_widen}.",
+        "The motion stays below. So the value is at least the bound, and not identifiable above it.",
+    )
+    heads = ("At a bound", "Not reached")
+    return [f"{head}: {own}. {cure} [W9]" for head, own, cure in zip(heads, lists, cures, strict=True) if own]
+
+
+def _in_words(problem: Problem, places: dict[tuple[str, str, float], list[str]]) -> list[str]:
+    return [
+        f"{spoken(name)} ({side}, {_bound(problem, name, bound, keys[0])}){_of(keys)}"
         for (name, side, bound), keys in places.items()
     ]
-    or_widen = "" if _is_far(problem, rmse) else ", or widen the bound"
-    return [f"At a bound: {'; '.join(found)}. Find the missing physics that the value stands in for{or_widen}. [W9]"]
+
+
+def _has_no_effect_above(name: str) -> bool:
+    """Whether a parameter is a limit, or the like: the larger, the less it does."""
+    effect, _, own = name.partition(".")
+    parameters = get_effect(effect).parameters if own else ()
+    return any(each.name == own and each.null == math.inf for each in parameters)
 
 
 def _bound(problem: Problem, name: str, bound: float, key: str) -> str:
@@ -267,7 +284,7 @@ def _bound(problem: Problem, name: str, bound: float, key: str) -> str:
 
 def in_words(labels: tuple[str, ...]) -> str:
     """Say labels: "encoder bias and friction of LF_HFE" for those of one joint, else one by one."""
-    names = [label.split("/")[0].replace("_", " ") for label in labels]
+    names = [spoken(label.split("/")[0]) for label in labels]
     keys = {label.split("/", 1)[1] for label in labels} - {ALL}
     if len(keys) == 1:
         return f"{conjoined(names)} of {keys.pop()}"

@@ -8,14 +8,16 @@ does. Changes add up: two joints may both be reversed.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 
-from pace_actuators.text import listed
+from pace_actuators.joint_units import JointType, units_for
+from pace_actuators.text import aligned, in_short, listed
 from pace_optim.identification.log_checks.balance import Balance, Links, View, balances, views_of, without
 from pace_optim.identification.log_checks.imu import late, other_axes, other_units, stuck_contacts
 from pace_optim.problem.problem import Problem
@@ -67,6 +69,8 @@ class Change:
     """The recording as it should be."""
     text: str
     """What was found, without the joints' names where ``{joints}`` stands, and the cure."""
+    limit: tuple[str, float] | None = None
+    """Of one joint's drive whose stated limit is wrong: that limit, and the torque that the motion shows [N m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +90,8 @@ class Finding:
     """Whether no fit of the log can be right."""
     imu_delays: Mapping[str, float] = field(default_factory=dict)
     """How much later than the encoders IMUs are read [s], by recording."""
+    limits: Mapping[str, tuple[str, float]] = field(default_factory=dict)
+    """Wrong limits as in :attr:`Change.limit`, by joint."""
 
     @property
     def sentence(self) -> str:
@@ -98,7 +104,29 @@ class Finding:
                 f"{100 * self.before:.2g} %.)"
             )
         )
-        return f"{listed(self.recordings)}: {self.text}{sure}"
+        return f"{listed(self.recordings)}: {self.text.format(joints=listed(self.joints, 6))}{sure}"
+
+    def table(self, types: Mapping[str, JointType]) -> str:
+        """Lines below the sentence: wrong limits joint by joint, and the facts to state; else "".
+
+        Args:
+            types: Of each joint.
+        """
+        if not self.limits:
+            return ""
+        names, pattern = in_short(list(self.limits))
+        unit = units_for("N m", [types[joint] for joint in self.limits])
+        stated, shown = zip(*self.limits.values(), strict=True)
+        seen = "needed" if self.check == _LIFTED.name else "seen"
+        rows = aligned(
+            [
+                [f"joint {pattern}".strip(), *names],
+                [f"stated [{unit}]", *stated],
+                [f"{seen} [{unit}]", *(f"{value:.3g}" for value in shown)],
+            ]
+        )
+        fact = json.dumps({joint: float(f"{value:.3g}") for joint, (_, value) in self.limits.items()})
+        return "\n".join(["", *(f"  {row}" for row in rows), f'  "effort_limit": {fact}'])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -351,9 +379,10 @@ def lifted_limits(evidence: Evidence) -> Iterator[Change]:
             yield Change(
                 joints=(j,),
                 view=_without_limits(view, j),
-                text=f"{{joints}} gives what its gains ask for, up to {np.abs(asked).max():.3g} N m, although "
-                f"{_limits_of(view, j)}. State the real effort_limit beside the log (NAME.json) or in its column map: "
-                "it replaces the model's and widens the bounds.",
+                text="{joints} give what the gains ask for, which is beyond the stated limit. State the real "
+                "effort_limit in the facts (--facts FILE, or NAME.json beside the log): it replaces the model's and "
+                "widens the bounds. If you do not know it, use the line below, which no longer cuts this motion.",
+                limit=(_limits_of(view, j), float(np.abs(asked).max())),
             )
 
 
@@ -366,12 +395,12 @@ def _without_limits(view: View, j: int) -> View:
 
 
 def _limits_of(view: View, j: int) -> str:
-    """The limits of a joint's drive, for a sentence."""
+    """The limits of a joint's drive, for a table."""
     limit, stall, fastest = view.effort_limit[j], view.saturation_effort[j], view.velocity_limit[j]
-    told = [f"its effort_limit is {limit:.3g} N m"] if np.isfinite(limit) else []
+    told = [f"{limit:.3g}"] if np.isfinite(limit) else []
     if np.isfinite(stall) and np.isfinite(fastest):
-        told.append(f"its torque ends at a saturation_effort of {stall:.3g} N m and {fastest:.3g} rad/s")
-    return listed(told)
+        told.append(f"{stall:.3g} at stall, 0 at {fastest:.3g} rad/s")
+    return "; ".join(told) or "no limit"
 
 
 def _of_known_gains(evidence: Evidence) -> list[int]:
@@ -398,13 +427,10 @@ def torque_limit(evidence: Evidence) -> Iterator[Change]:
             yield Change(
                 joints=(j,),
                 view=changed(limit),
-                text=f"the torque of {{joints}} ends at about {limit:.3g} N m, stated is "
-                f"{_or_none(view.effort_limit[j])}. State effort_limit, or let it be sought: --unknown effort_limit.",
+                text="the torque of {joints} ends below the stated limit. State the real effort_limit in the facts "
+                "(--facts FILE, or NAME.json beside the log), or let it be sought: --unknown effort_limit.",
+                limit=(_limits_of(view, j), limit),
             )
-
-
-def _or_none(limit: float) -> str:
-    return f"{limit:.3g} N m" if np.isfinite(limit) else "no limit"
 
 
 def turned_gravity(evidence: Evidence) -> Iterator[Change]:
@@ -646,7 +672,7 @@ def _finding(check: Check, change: Change, before: float | None = None, after: f
     names = tuple(change.view.joints[j] for j in sorted(change.joints))
     return Finding(
         check=check.name, recordings=(change.view.name,), joints=names, before=before, after=after,
-        text=change.text.format(joints=listed(names, 6)), stops=check.stops,
+        text=change.text, stops=check.stops, limits={names[0]: change.limit} if change.limit else {},
     )  # fmt: skip
 
 
@@ -699,14 +725,39 @@ def check_log(problem: Problem) -> list[Finding]:
     for view in views:
         for finding in explained(view):
             merged.setdefault((finding.check, finding.joints), []).append(finding)
-    return [
-        replace(
-            each[0],
-            recordings=tuple(f.recordings[0] for f in each),
-            imu_delays={name: delay for f in each for name, delay in f.imu_delays.items()},
+    return _with_limits_together(
+        [
+            replace(
+                each[0],
+                recordings=tuple(f.recordings[0] for f in each),
+                imu_delays={name: delay for f in each for name, delay in f.imu_delays.items()},
+                limits={name: max((f.limits[name] for f in each), key=lambda own: own[1]) for name in each[0].limits},
+            )
+            for each in merged.values()
+        ],
+        views[0].joints,
+    )
+
+
+def _with_limits_together(found: list[Finding], order: Sequence[str]) -> list[Finding]:
+    """Findings with one of each check for all joints whose limits are wrong, in the robot's order."""
+    result: list[Finding] = []
+    for each in found:
+        at = next((i for i, one in enumerate(result) if each.limits and one.limits and one.check == each.check), None)
+        if at is None:
+            result.append(each)
+            continue
+        one, joints = result[at], sorted((*result[at].joints, *each.joints), key=list(order).index)
+        limits = {**one.limits, **each.limits}
+        result[at] = replace(
+            one,
+            recordings=tuple(dict.fromkeys((*one.recordings, *each.recordings))),
+            joints=tuple(joints),
+            before=max(one.before or 0.0, each.before or 0.0),
+            after=max(one.after, each.after),
+            limits={joint: limits[joint] for joint in joints},
         )
-        for each in merged.values()
-    ]
+    return result
 
 
 def checked(problem: Problem, trust: bool = False, tell: Callable[[str], None] = tell_nobody) -> Problem:
@@ -719,7 +770,8 @@ def checked(problem: Problem, trust: bool = False, tell: Callable[[str], None] =
     found = check_log(problem)
     if (wrong := [each.sentence for each in found if each.stops]) and not trust:
         raise ValueError(f"{' '.join(wrong)} If the log is right as it is, give --trust_log.")
-    said = tuple(f"{each.sentence} [W3]" for each in found)
+    types = dict(zip(problem.joint_names, problem.joint_types, strict=True))
+    said = tuple(f"{each.sentence} [W3]{each.table(types)}" for each in found)
     for each in said:
         tell(f"warning: {each}")
     problem = problem.with_imu_delays(_delays_of_whole(problem, found))

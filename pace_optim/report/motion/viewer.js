@@ -1,9 +1,8 @@
 "use strict";
 // The robot in 3-D: measured motion as a ghost, simulated motion over it, coloured by error. WebGL 1, no library.
-(() => {
+pace.ready.then(() => {
   const MOST_PIECES = 24; // of a round shape
   const read = (element) => JSON.parse(element.querySelector('script[type="application/json"]').textContent);
-  const decode = (text) => new Float32Array(Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer);
   const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
   // ---- rotations: quaternions are (w, x, y, z) as MuJoCo's --------------------------------------------------------
@@ -94,8 +93,15 @@
   const capsule = (radius, half) => revolve(
     [...arc(-Math.PI / 2, 0, 0).map(([r, h, n, u]) => [r * radius, h * radius - half, n, u]),
       ...arc(0, Math.PI / 2, 0).map(([r, h, n, u]) => [r * radius, h * radius + half, n, u])]);
-  function meshTriangles(vertices, faces) {
-    const out = [], at = (i) => vertices.slice(3 * i, 3 * i + 3);
+  /** Columns, each a curve, row by row. */
+  function rows(columns) {
+    const out = new Float64Array(columns.length * (columns[0]?.by.length ?? 0));
+    columns.forEach((column, j) => pace.curve(column).forEach((value, i) => { out[i * columns.length + j] = value; }));
+    return out;
+  }
+  function meshTriangles(mesh) {
+    const vertices = rows(mesh.vertices), faces = pace.curve(mesh.faces);
+    const out = [], at = (i) => [...vertices.subarray(3 * i, 3 * i + 3)];
     for (let f = 0; f < faces.length; f += 3) {
       const [a, b, c] = [at(faces[f]), at(faces[f + 1]), at(faces[f + 2])];
       const u = b.map((x, i) => x - a[i]), v = c.map((x, i) => x - a[i]);
@@ -140,10 +146,10 @@
       }
       return shapes.get(key);
     };
-    const pieces = scene.geoms.map((geom, g) => {
+    const pieces = scene.geoms.map((geom) => {
       const one = [1, 1, 1], [a, b, c] = geom.size;
       const of = { ...geom, pos: geom.shift ? add(geom.pos, rotate(geom.quat, geom.shift)) : geom.pos };
-      if (geom.shape === "mesh") return { ...of, scale: one, shape: buffer(`mesh ${g}`, () => meshTriangles(geom.vertices, geom.faces)) };
+      if (geom.shape === "mesh") return { ...of, scale: one, shape: buffer(`mesh ${geom.mesh}`, () => meshTriangles(scene.meshes[geom.mesh])) };
       if (geom.shape === "capsule") return { ...of, scale: one, shape: buffer(`capsule ${a} ${b}`, () => capsule(a, b)) };
       const name = geom.shape === "ellipsoid" ? "sphere" : geom.shape;
       const scale = { sphere: [a, a, a], cylinder: [a, a, b] }[geom.shape] ?? [a, b, c];
@@ -221,9 +227,10 @@
     scene.joints.forEach((joint, j) => scene.bodies[joint.body].joints.push(j));
     const m = scene.joints.length, count = content.recordings.length;
     const recordings = content.recordings.map((recording) => ({
-      ...recording, time: decode(recording.time), measured: decode(recording.measured), simulated: decode(recording.simulated),
-      base: recording.base && decode(recording.base), standing: recording.base && decode(recording.standing),
+      ...recording, time: pace.curve(recording.time), measured: rows(recording.measured), error: rows(recording.error),
+      base: recording.base && rows(recording.base), standing: recording.base && rows(recording.standing),
     }));
+    for (const recording of recordings) recording.simulated = recording.measured.map((value, i) => value + recording.error[i]);
     const render = makeRenderer(canvas, scene);
     if (!render) {
       element.querySelector(".replay-note").textContent = "This browser draws no WebGL, so the replay cannot be shown.";
@@ -326,4 +333,4 @@
     open();
   }
   for (const element of document.querySelectorAll(".replay")) makeReplay(element);
-})();
+});

@@ -10,7 +10,7 @@ from typing import Any
 from markupsafe import Markup
 
 from pace_actuators.joint_units import JointType, joint_label, units_for
-from pace_actuators.text import percent, position_text, position_unit, short_duration, three_figures
+from pace_actuators.text import in_short, percent, position_text, position_unit, short_duration, three_figures
 
 from ..markup import Section, bullets, choice, html, json_script, log_step, table
 from ..run_data import RunData
@@ -42,11 +42,10 @@ def failure(run: RunData) -> Section | None:
         title="Where the model fails",
         lead=content["summary"] + _basis(content),
         html=html(
-            '{{ places }}{{ by_joint }}{{ notes }}<div class="chooser">{{ recording }}{{ joint }}'
+            '{{ by_joint }}{{ notes }}<div class="chooser">{{ recording }}{{ joint }}'
             '{% for name, made in figures.items() %}<div data-figure="{{ name }}"><h3>{{ made.title }}</h3>'
             '<p class="said"></p><div class="canvas" style="height:{{ made.height }}px"></div></div>{% endfor %}'
             "{{ script }}</div>",
-            places=_places(content),
             by_joint=_by_joint(content),
             notes=bullets(content["notes"], "notes") if content["notes"] else "",
             recording=choice("recording", recordings, "failure-", r),
@@ -69,24 +68,16 @@ def _basis(content: dict[str, Any]) -> str:
     return f" On {', '.join(content['data'])}, which are not the run's own recordings." if content["data"] else ""
 
 
-def _places(content: dict[str, Any]) -> Markup:
-    """The worst places, one sentence each; a click shows the joint's curves."""
-    return html(
-        '{% if places %}<ol class="places">{% for place in places %}<li><a href="#failure" '
-        'data-joint="{{ place.joint }}">{{ place.sentence }}</a></li>{% endfor %}</ol>{% endif %}',
-        places=content["worst_places"],
-    )
-
-
 def _by_joint(content: dict[str, Any]) -> Markup:
     parts = [part for part in ("train", "validation") if part in content["rmse"]]
     joints = content["joints"]
     types = [own for joint in joints.values() for own in types_of(joint)]
     factor, unit = position_unit([joint["rmse"].get(part) for joint in joints.values() for part in parts], ["hinge"])
     rows = []
-    for (name, joint), own in zip(joints.items(), types, strict=True):
+    short, pattern = in_short(list(joints))
+    for (name, joint), shown, own in zip(joints.items(), short, types, strict=True):
         share = joint["share_above_floor"]
-        label = joint_label(name, own, types, unit)
+        label = joint_label(shown, own, types, unit)
         rows.append(
             [
                 html('<a href="#failure" data-joint="{{ name }}"><b>{{ label }}</b></a>', name=name, label=label),
@@ -101,7 +92,13 @@ def _by_joint(content: dict[str, Any]) -> Markup:
             ]
         )
     unit, words = units_for(unit, types), {"train": "training", "validation": "validation"}
-    head = ["joint", *(f"{words[part]} [{unit}]" for part in parts), f"noise [{unit}]", "error² above noise", "where"]
+    head = [
+        f"joint {pattern}".strip(),
+        *(f"{words[part]} [{unit}]" for part in parts),
+        f"noise [{unit}]",
+        "error² above noise",
+        "where",
+    ]
     return table(head, rows, "by-joint")
 
 

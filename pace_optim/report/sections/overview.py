@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from textwrap import dedent
 
 import numpy as np
 from markupsafe import Markup
 
 from pace_actuators.drive_result import ALL
 from pace_actuators.joint_units import JointType, joint_label, units_for
-from pace_actuators.text import SHOWN, duration, position_text, position_unit, pretty_unit, three_figures
+from pace_actuators.text import SHOWN, duration, in_short, position_text, position_unit, pretty_unit, three_figures
 from pace_optim.run.result import FitResult
-from pace_optim.run.summary import ABOVE_NOISE, above_noise, next_lines
+from pace_optim.run.summary import ABOVE_NOISE, above_noise, few_joints, next_lines
 
 from ..markup import Section, bullets, folded, html
 from ..run_data import RunData
@@ -84,10 +85,11 @@ def _verdict(run: RunData) -> str:
     if len(run.result.joint_names) > 1:
         worst, where = _worst_joint(run.result)
         sentences.append(f"The worst joint is {worst} with {position_text(where, [run.result.joint_type(worst)])}.")
+    sentences.append(few_joints(run.result))
     last = run.result.stop_reasons[-1] if run.result.stop_reasons else ""
     if last.startswith(_STOPPED_EARLY):
         sentences.append(f"The fit was stopped before it had converged ({last}): going on may lower the error.")
-    return " ".join(sentences)
+    return " ".join(filter(None, sentences))
 
 
 def _next(run: RunData) -> str:
@@ -165,7 +167,7 @@ def _warnings(result: FitResult) -> Markup:
             text += f" But the training error is {more}."
         return html('<div class="callout good"><h3>No warnings of parameters</h3><p>{{ text }}</p></div>', text=text)
     title = "1 warning" if count == 1 else f"{count} warnings"
-    sentences = [pretty_unit(text) for text in result.warnings]
+    sentences = [_with_table(pretty_unit(text)) for text in result.warnings]
     most = SHOWN if count > SHOWN + 1 else count  # one more takes no more room than its heading would
     said = bullets(sentences[:most])
     if rest := sentences[most:]:
@@ -177,13 +179,22 @@ def _warnings(result: FitResult) -> Markup:
     return html(text, title=title, said=said)
 
 
+def _with_table(warning: str) -> Markup:
+    """A warning, with the table and the line to copy below it that some have."""
+    sentence, _, lines = warning.partition("\n")
+    rows, _, line = dedent(lines).rpartition("\n")
+    text = '{{ sentence }}{% if line %}<pre class="rows">{{ rows }}</pre><pre>{{ line }}</pre>{% endif %}'
+    return html(text, sentence=sentence, rows=rows, line=line)
+
+
 def _errors_by_joint(result: FitResult) -> Markup:
     """A row of bars per joint; a click shows its curves."""
     parts = [(name, result.rmse[name]) for name in ("train", "validation") if result.rmse.get(name)]
     every = [value for _, errors in parts for joint, value in errors.items() if joint != ALL]
     types = result.joint_types
     factor, unit = position_unit(every, ["hinge"])
-    labels = [joint_label(j, own, types, unit) for j, own in zip(result.joint_names, types, strict=True)]
+    names, pattern = in_short(result.joint_names)
+    labels = [joint_label(j, own, types, unit) for j, own in zip(names, types, strict=True)]
     largest = max([value for value in every if np.isfinite(value)], default=1.0) or 1.0
     rows = {
         (joint, label): [
@@ -193,13 +204,14 @@ def _errors_by_joint(result: FitResult) -> Markup:
         for joint, label in zip(result.joint_names, labels, strict=True)
     }
     return html(
-        '<h3>Error of each joint [{{ unit }}] {% for name in names %}<span class="key {{ name }}">'
+        '<h3>Error of each joint {{ pattern }} [{{ unit }}] {% for name in names %}<span class="key {{ name }}">'
         '{{ words[name] }}</span>{% endfor %}</h3><div class="errors">{% for (joint, label), bars in rows.items() %}'
         '<a class="error" href="#trajectories" data-joint="{{ joint }}"><b>{{ label }}</b><div>'
         '{% for name, width, value in bars %}<div class="bar {{ name }}"><i style="width:{{ width }}%"></i>'
         "<span>{{ value }}</span></div>{% endfor %}</div></a>{% endfor %}</div>",
         unit=units_for(unit, types),
         names=[name for name, _ in parts],
+        pattern=pattern,
         words={"train": "training", "validation": "validation"},
         rows=rows,
     )

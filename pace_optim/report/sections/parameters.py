@@ -9,7 +9,7 @@ from typing import Any
 from markupsafe import Markup
 
 from pace_actuators.drive_result import ALL
-from pace_actuators.text import in_words, pretty_unit, value_and_error
+from pace_actuators.text import in_short, in_words, pretty_unit, value_and_error
 
 from ..markup import Section, bold, html, joined, table
 from ..run_data import RunData
@@ -85,11 +85,14 @@ def _card(run: RunData, name: str, unit: str) -> Markup:
     own = [run.bounds[f"{name}/{key}"] for key in values if f"{name}/{key}" in run.bounds]
     low, high = _padded(min(ends), max(ends), own)
     files = run.result.file_values.get(name, {})
-    titles = {key: f"{key} (file {files[key]:.4g})" if key in files else key for key in values}
+    short, pattern = in_short(list(values))
+    titles = {
+        key: f"{own} (file {files[key]:.4g})" if key in files else own for key, own in zip(values, short, strict=True)
+    }
     rows = [_row(run, name, key, titles[key], "", (low, high)) for key in values]
     rows.append(["", "", "", _axis(low, high), "", ""])
     what = "link" if name in run.result.link_parameters else "joint"
-    head = [what, "value", "± std", "value and 95 % interval", "between its bounds", ""]
+    head = [f"{what} {pattern}".strip(), "value", "± std", "value and 95 % interval", "between its bounds", ""]
     return _article(in_words(name), pretty_unit(unit), table(head, rows, "values"))
 
 
@@ -205,8 +208,9 @@ def _flags(run: RunData, label: str, value: float) -> Markup:
         flags.append("not determined: its prior")
     elif label in result.no_influence:
         flags.append("no influence")
-    for group in () if result.std_means_nothing else result.indistinguishable:
-        if label in group:
+    groups = () if result.std_means_nothing else [each for each in result.indistinguishable if label in each]
+    for group in groups:
+        if not any(set(group) < set(larger) for larger in groups):
             others = [_beside(other, label) for other in group if other != label]
             flags.append("cannot be separated from " + " and ".join(dict.fromkeys(others)))
     return html('{% for flag in flags %}<span class="flag">{{ flag }}</span>{% endfor %}', flags=flags)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,13 +11,15 @@ from markupsafe import Markup
 
 from pace_actuators.text import listed
 
-from ..markup import Section, choice, html, json_script
+from ..markup import Section, choice, curve, html, json_script
 from ..motion import Looks, Motion, looks_of, motions_of, scene_of
 from ..motion.scene import scalar_joints
 from ..run_data import RunData
 
 _RECORDINGS_ON_PAGE = 8
-"""Those with the largest errors; each takes some 8 bytes a joint and picture."""
+"""Those with the largest errors; each takes some 4 bytes a joint and picture."""
+_STEP = 1e-5
+"""To which positions and times are rounded [rad, m, s]."""
 _MESHES = 3
 """Meshes and links that the note names."""
 _SPEEDS = (("real time", 1.0), ("1/4", 0.25), ("1/10", 0.1), ("1/50", 0.02))
@@ -51,7 +52,7 @@ def replay(run: RunData) -> Section | None:
 def viewer(model: mujoco.MjModel, motions: Sequence[Motion], looks: Looks | None = None) -> Markup:
     """HTML of a viewer that the page's script brings to life."""
     content = {
-        "scene": scene_of(model, looks),
+        "scene": _encode_scene(scene_of(model, looks)),
         "joints": [model.joint(j).name for j in scalar_joints(model)],
         "scale": _scale(motions),
         "recordings": [_encode(motion) for motion in motions],
@@ -92,19 +93,35 @@ def _scale(motions: Sequence[Motion]) -> list[float]:
     return [max(largest, 1e-6)] * motions[0].measured.shape[1]
 
 
+def _encode_scene(scene: dict[str, Any]) -> dict[str, Any]:
+    """A scene whose meshes stand once each, under ``meshes``; their shapes have the index."""
+    meshes: dict[tuple[tuple[float, ...], tuple[int, ...]], int] = {}
+    geoms = []
+    for geom in scene["geoms"]:
+        if geom["shape"] == "mesh":
+            mesh = tuple(geom["vertices"]), tuple(geom["faces"])
+            kept = {key: value for key, value in geom.items() if key not in ("vertices", "faces")}
+            geoms.append(kept | {"mesh": meshes.setdefault(mesh, len(meshes))})
+        else:
+            geoms.append(geom)
+    encoded = [
+        {"vertices": _curves(np.reshape(vertices, (-1, 3)), 1e-4), "faces": curve(np.array(faces), 1.0)}
+        for vertices, faces in meshes
+    ]
+    return scene | {"geoms": geoms, "meshes": encoded}
+
+
 def _encode(motion: Motion) -> dict[str, Any]:
     base: dict[str, Any] = {}
     if motion.base is not None and motion.standing is not None:
-        standing = motion.standing.astype(float)
-        base = {"base": _base64(motion.base), "standing": _base64(standing), "feet": list(motion.feet)}
+        base = {"base": _curves(motion.base), "standing": _curves(motion.standing, 1.0), "feet": list(motion.feet)}
     return base | {
         "name": motion.name,
-        "time": _base64(motion.time),
-        "measured": _base64(motion.measured),
-        "simulated": _base64(motion.simulated),
+        "time": curve(motion.time, _STEP),
+        "measured": _curves(motion.measured),
+        "error": _curves(motion.simulated - motion.measured),
     }
 
 
-def _base64(values: np.ndarray) -> str:
-    with np.errstate(over="ignore"):  # a simulation that diverged
-        return base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode()
+def _curves(values: np.ndarray, step: float = _STEP) -> list[dict[str, Any]]:
+    return [curve(column, step) for column in values.T]

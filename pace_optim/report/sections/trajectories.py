@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,11 +10,13 @@ from pace_actuators.joint_units import JointType, units_for
 from pace_actuators.text import position_unit, three_figures
 from pace_optim.run.tensors import held_out_spans, rms
 
-from ..markup import Section, choice, html, json_script
+from ..markup import Section, choice, curve, html, json_script
 from ..run_data import RecordingData, RunData
 
-_SAMPLES_ON_PAGE = 160_000
-"""Of all joints and recordings together; each takes some 19 bytes of the page."""
+_SAMPLES_ON_PAGE = 70_000
+"""Of all joints and recordings together; each takes some 7 bytes of the page."""
+_STEP = 1e-6
+"""To which positions and times are rounded [rad, m, s]."""
 _FEWEST_PER_CURVE = 1200
 _MOST_PER_CURVE = 20_000
 
@@ -56,11 +57,11 @@ def _largest_error(recordings: Sequence[RecordingData]) -> tuple[int, int]:
 
 
 def _encode(recording: RecordingData, per_curve: int, joint_types: Sequence[JointType]) -> dict:
-    """One recording for the page's script: numbers as base64 of little-endian arrays."""
+    """One recording for the page's script: curves rounded to a step below what can be seen."""
     time = recording.time - recording.time[0]
     return {
         "name": recording.name,
-        "time": _base64(time, "<f4"),
+        "time": curve(time, _STEP),
         "held_out": held_out_spans(time, ~recording.held_out),
         "joints": [_encode_joint(recording, j, per_curve, own) for j, own in enumerate(joint_types)],
     }
@@ -70,14 +71,15 @@ def _encode_joint(recording: RecordingData, j: int, per_curve: int, joint_type: 
     target, measured, error = recording.target[:, j], recording.measured[:, j], recording.error[:, j]
     kept = samples_to_draw((error, measured, target), per_curve)
     factor, unit = position_unit([float(np.abs(error).max(initial=0.0))], [joint_type])
+    step = 5e-5 * float(np.abs(error[np.isfinite(error)]).max(initial=0.0))
     train, held_out = rms(error[recording.train]), rms(error[recording.held_out])
     parts = [(name, value) for name, value in (("training", train), ("validation", held_out)) if value is not None]
     words = ", ".join(f"{three_figures(factor * value)} {unit} in {name}" for name, value in parts)
     return {
-        "sample": None if len(kept) == len(error) else _base64(kept, "<u4"),
-        "target": _base64(target[kept].round(6), "<f4"),
-        "measured": _base64(measured[kept].round(6), "<f4"),
-        "error": _base64(error[kept], "<f4"),
+        "sample": None if len(kept) == len(error) else curve(kept, 1.0),
+        "target": curve(target[kept], _STEP),
+        "measured": curve(measured[kept], _STEP),
+        "error": curve(error[kept], min(_STEP, step) or _STEP),
         "factor": factor,
         "unit": unit,
         "position_unit": units_for("rad", [joint_type]),
@@ -103,11 +105,7 @@ def samples_to_draw(curves: tuple[np.ndarray, ...], most: int) -> np.ndarray:
     grid = np.minimum(np.arange(-(-count // width) * width), count - 1).reshape(-1, width)
     rows = np.arange(len(grid))
     kept = [np.array([0, count - 1])]
-    for curve in curves:
-        values = np.nan_to_num(curve)[grid]
+    for each in curves:
+        values = np.nan_to_num(each)[grid]
         kept += [grid[rows, values.argmin(axis=1)], grid[rows, values.argmax(axis=1)]]
     return np.unique(np.concatenate(kept))
-
-
-def _base64(values: np.ndarray, dtype: str) -> str:
-    return base64.b64encode(np.ascontiguousarray(values, dtype=dtype).tobytes()).decode()

@@ -32,7 +32,9 @@ from pace_envs.rl import (
     train,
 )
 from pace_envs.rl.playing import write_video
+from pace_envs.rl.run_folder import new_run_folder
 from pace_envs.rl.training import load_cfg
+from pace_envs.rsl_rl_cfg import RslRlOnPolicyRunnerCfg
 from pace_envs.rsl_rl_wrapper import RslRlVecEnvWrapper
 from pace_envs.tasks.velocity import VelocityEnvCfg, fix_command, play_cfg
 
@@ -339,3 +341,10 @@ def test_the_command_lines_train_and_play(tmp_path, monkeypatch):
 def test_a_training_without_a_checkpoint_is_told_which_file_is_expected(tmp_path):
     with pytest.raises(ValueError, match=r"holds no checkpoint: expected model_0\.pt"):
         latest_checkpoint(tmp_path)
+
+
+def test_a_training_s_folder_has_the_name_of_its_task(tmp_path):
+    """A quadruped's and an arm's runs were both in `velocity`."""
+    for experiment, name in (("my_robot.py:My-Arm-v0", "My-Arm-v0"), ("go2_velocity", "go2_velocity")):
+        assert new_run_folder(tmp_path, experiment).parent == tmp_path / name
+    assert RslRlOnPolicyRunnerCfg().experiment_name == ""

@@ -72,11 +72,14 @@ def test_limits_stay_where_one_joint_has_none(result):
 
 
 def test_an_export_of_a_fit_that_is_not_to_be_trusted_says_so(result):
-    assert not any("[W22]" in note or "[W23]" in note for note in export(result, "json").notes)
+    assert export(result, "json").warnings == []
     content = json.loads(result.read_text()) | {"times_noise": 171.0, "at_bound": [f"friction/{JOINTS[0]}"]}
     result.write_text(json.dumps(content))
-    notes = " ".join(export(result, "json").notes)
-    assert "171 times the measurement noise" in notes and f"friction/{JOINTS[0]} ended at a bound" in notes
+    far, bound = export(result, "json").warnings
+    assert "171 times the measurement noise" in far and far.endswith("[W22]")
+    assert f"friction of {JOINTS[0]} ended at a bound" in bound and bound.endswith("[W23]")
+    done = run_script("export", result, "--format", "json")
+    assert done.stderr.count("warning: ") == 2, done.stderr
 
 
 def test_an_export_of_a_fit_with_a_short_step_names_the_step_to_train_at(result):

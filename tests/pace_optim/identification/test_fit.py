@@ -423,8 +423,8 @@ def test_the_progress_of_a_start_is_its_own(tmp_path):
     run._after_iteration([first, Descent(x=x, stage=stage)])
     run._after_iteration([first, Descent(x=x, stage=stage, scores=[1e-6], iteration=1)])
     run.progress.close()
-    assert "fit on pieces: 4/15 at most  error 0.1 mrad" in out.getvalue()
-    assert "fit on pieces from start 2: 1/15 at most  error 1 mrad" in out.getvalue()
+    assert "fit on pieces: 4/15 at most  error of pieces 0.1 mrad" in out.getvalue()
+    assert "fit on pieces from start 2: 1/15 at most  error of pieces 1 mrad" in out.getvalue()
 
 
 def test_a_step_that_takes_long_is_named_again():

@@ -82,6 +82,12 @@ def test_many_warnings_do_not_hide_the_page(tmp_path, count, folded):
     assert (f"<summary>{folded} more</summary>" in rest) == bool(folded)
 
 
+def test_a_warning_s_table_keeps_its_columns(tmp_path):
+    warning = 'limits are wrong [W3]\n  joint  stated\n  knee       30\n  "effort_limit": {"knee": 50.0}'
+    html = write_report(write_run(tmp_path / "run", make_result(warnings=[warning]))).read_text("utf-8")
+    assert '<pre class="rows">joint  stated\nknee       30</pre><pre>&#34;effort_limit&#34;' in html
+
+
 def test_warnings_come_before_everything_else(tmp_path):
     text = page_of(write_run(tmp_path / "run", make_result(warnings=["friction of hip is at its upper bound"]))).text
     assert text.index("1 warning: read before") < text.index("Error of each joint") < text.index("Drag to zoom")
@@ -143,7 +149,7 @@ def test_values_that_are_no_numbers_do_not_break_it(tmp_path):
     assert "trajectories" in page_of(folder).ids
 
 
-def test_twenty_seconds_of_twelve_joints_stay_below_eight_megabytes(tmp_path):
+def test_twelve_joints_stay_below_three_megabytes(tmp_path):
     names = [f"joint_{i}" for i in range(12)]
     folder = write_run(tmp_path / "run", make_result(joint_names=names))
     generator = torch.Generator().manual_seed(0)
@@ -155,11 +161,11 @@ def test_twenty_seconds_of_twelve_joints_stay_below_eight_megabytes(tmp_path):
         return part | {"name": f"{samples}"}
 
     write_tensors(folder / "best_trajectory.pt", {"joint_names": names, "recordings": [recording(8000)]})
-    assert write_report(folder).stat().st_size < 7.5e6
+    assert write_report(folder).stat().st_size < 3e6
     content = {"joint_names": names, "recordings": [recording(60_000) for _ in range(3)]}
     write_tensors(folder / "best_trajectory.pt", content)
     start = time.perf_counter()
-    assert write_report(folder).stat().st_size < 8.5e6
+    assert write_report(folder).stat().st_size < 3.1e6
     assert time.perf_counter() - start < 10.0
 
 

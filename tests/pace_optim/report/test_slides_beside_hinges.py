@@ -11,6 +11,7 @@ from command_lines import run_script
 from diagnoses import make_diagnosis
 from log_reading import load_recordings
 from models import GANTRY
+from report_pages import contents_of
 
 from pace_actuators.files import write_json
 from pace_actuators.joint_units import units_for
@@ -104,8 +105,9 @@ def test_the_comparison_tells_each_in_its_unit(fitted):
     page = report_text(run).decode()
     assert "<b>axis [mm]</b>" in page and "<b>swing [mrad]</b>" in page
     assert "Armature <small>kg</small>" in page and "Armature <small>kg m²</small>" in page  # an axis for each
-    assert '"position_unit":"m"' in page and '"position_unit":"rad"' in page
-    assert "position [m]" in page and "position [rad]" in page and "load force [N]" in page
+    data = contents_of(page)
+    assert '"position_unit":"m"' in data and '"position_unit":"rad"' in data
+    assert "position [m]" in data and "position [rad]" in data and "load force [N]" in data
 
 
 def test_its_pictures_name_the_unit_of_each_axis(fitted, tmp_path):

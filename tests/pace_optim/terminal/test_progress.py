@@ -27,8 +27,65 @@ def test_off_a_terminal_a_step_has_a_line_at_once_and_then_times():
     lines = stream.getvalue().splitlines()
     fitting = [line for line in lines if line.startswith("fitting")]
     assert 4 <= sum(line.count(" s") for line in fitting) <= 5
-    assert len(fitting) == 2  # every third time anew
+    assert len(fitting) == 1  # nothing is printed twice
     assert sum(line.startswith("search: ") for line in lines) <= 2
+
+
+def test_a_long_step_goes_on_below_itself_and_a_counter_anew():
+    stream = io.StringIO()
+    progress = ProgressLine(stream, 0.0)
+    for _ in range(10):
+        progress.say("fitting")
+    for done in range(5):
+        progress.show("search", done, 9, "error 1 mrad", None, 10)
+    progress.close()
+    first, more, *counted = stream.getvalue().splitlines()
+    assert first.startswith("fitting") and first.count(" s") == 8 and more == "      0 s  0 s"
+    assert [line.split("/")[0] for line in counted] == ["search: 0", "search: 3"]
+
+
+SHARES = {"reading": 0.05, "fit on pieces": 0.2, r"fitting .* alone": 0.9, "fit on whole": 0.6}
+
+
+@pytest.mark.parametrize(
+    ("seconds", "half"),
+    [
+        ({"reading": 10, "fit on pieces": 40, "fit on whole": 30, "fitting log alone": 20}, "fit on whole"),
+        ({"reading": 10, "fit on pieces": 90, "fit on whole": 20, "fitting log alone": 10}, "fit on pieces"),
+        ({"reading": 30, "fit on pieces": 10, "fit on whole": 50, "fitting log alone": 40}, "fit on whole"),
+        ({"reading": 5, "fit on whole": 60, "fitting log alone": 30}, "fit on whole"),
+    ],
+)
+def test_half_way_the_time_left_is_within_a_factor_of_three(monkeypatch, seconds, half):
+    now = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    progress = ProgressLine(io.StringIO(), 1e9)
+    progress.expect(SHARES)
+    total = sum(seconds.values())
+    for step, duration in seconds.items():
+        progress.say(step)
+        for _ in range(duration):
+            if now[0] >= total / 2:
+                assert step == half and total / 6 <= progress.left <= 1.5 * total
+                return
+            now[0] += 1.0
+
+
+def test_the_time_left_is_stated_with_the_step_that_began(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    stream = io.StringIO()
+    progress = ProgressLine(stream, 60.0)
+    progress.say("fit on pieces")  # nothing is expected yet
+    progress.expect(SHARES)
+    for now[0], step in ((60.0, "fit on whole"), (540.0, "fitting log alone")):
+        progress.say(step)
+    progress.close()
+    assert stream.getvalue().splitlines() == [
+        "fit on pieces  0 s",
+        "fit on whole  60 s, about 40 s left",
+        "fitting log alone  540 s, about 60 s left",
+    ]
 
 
 def test_a_line_of_a_file_is_ended_before_another_step_or_a_message():

@@ -83,7 +83,7 @@ def test_the_verdict_is_printed_first_then_likes_and_advice_and_sizes_with_the_f
     assert lines[0] == "verdict: effect" and lines[1] == content["summary"]
     assert lines[2:4] == ["torque_gain cannot be separated from payload.", "- Record more."]
     (size,) = size_lines(content["sizes"])
-    assert size.startswith("  torque_gain.gain of knee: ") and size.endswith("times what was stated, at its bound")
+    assert size.startswith("  torque gain of knee: ") and size.endswith("times what was stated, at its bound")
 
 
 def test_a_command_prints_the_verdict_once_and_the_three_next_steps_last(tmp_path, monkeypatch, capsys):

@@ -147,6 +147,20 @@ def test_bounds_are_told_with_side_and_value_and_joints_are_gathered():
     )
 
 
+def test_a_limit_at_its_upper_bound_was_not_reached():
+    """A reader was asked to find the physics that a torque limit stands in for, which no motion had reached."""
+    problem = make_problem(record(chirp(0.2))).with_effects(["torque_limit", "torque_gain"])
+    limit, gain = (f"{name}/servo" for name in ("torque_limit.effort", "torque_gain.gain"))
+    high, low = problem.space.upper.clone(), problem.space.lower.clone()
+    told = fit_warnings(problem, high, known(problem, at_bound=(limit, gain)), FINE)
+    bound = f"{float(high[problem.space.labels.index(limit)]):g} N m"
+    missing, open_above = (each for each in told if "[W9]" in each)
+    assert "torque gain (upper" in missing and "torque limit" not in missing
+    assert f"torque limit effort (upper, {bound}) of servo" in open_above and "physics" not in open_above
+    (missing,) = (each for each in fit_warnings(problem, low, known(problem, at_bound=(limit,)), FINE) if "W9" in each)
+    assert "physics" in missing
+
+
 @pytest.mark.parametrize("others", [(), ("encoder_bias/servo",)])
 def test_commands_count_as_logged_too_rarely_where_a_delay_of_none_is_too_late(others):
     problem = make_problem(record(noise=1e-4))

@@ -1,5 +1,6 @@
 """The checks of a log name what is wrong with it before a search, and nothing where nothing is."""
 
+import json
 import re
 from dataclasses import MISSING, fields, replace
 from types import SimpleNamespace
@@ -94,6 +95,23 @@ def test_a_limit_that_the_motion_refutes_is_said_before_the_search(tmp_path):
     (warning,) = (each for each in said if "State the real effort_limit" in each)
     assert warning.startswith("warning: ") and made.recording.joint_names[0] in warning
     assert warning.removeprefix("warning: ") in problem.contradictions
+
+
+def test_refuted_limits_of_all_joints_are_one_warning_with_the_facts_to_state(tmp_path):
+    """A reader with a URDF whose limits were guesses got seven long warnings in a row."""
+    made = inputs.make("clean", 0)
+    asked = np.abs(made.recording.drive.stiffness * (made.recording.des_dof_pos - made.recording.dof_pos)).max(axis=0)
+    recording = replace(made.recording, drive=replace(made.recording.drive, effort_limit=0.2 * asked))
+    problem = checked(inputs.problem_of(replace(made, recording=recording), tmp_path), trust=True)
+    (warning,) = (each for each in problem.contradictions if "the stated limit" in each)
+    sentence, head, *rows, fact = warning.split("\n")
+    assert sentence.endswith("[W3]") and len(rows) > 1
+    assert [word for word in head.split() if word.isalpha() and len(word) > 1] == ["joint", "stated", "needed"]
+    needed = json.loads(f"{{{fact}}}")["effort_limit"]
+    assert [row.split()[0] for row in rows] == [j for j in made.recording.joint_names if j in needed]
+    for row in rows:
+        joint, stated, shown = row.split()
+        assert float(shown) == needed[joint] > float(stated)
 
 
 def test_every_bound_is_kept_and_little_is_lost_by_it():

@@ -105,6 +105,11 @@ def test_a_file_of_gains_that_no_log_uses_is_named_with_the_cure(tmp_path):
     facts = facts_of(tmp_path)
     assert unused_facts([path]) == f"{facts} is not used. If it holds the gains of these logs: --facts {facts}"
     assert unused_facts([path], facts) == ""
+    (tmp_path / "elsewhere").mkdir()
+    others = facts_of(tmp_path / "elsewhere", name="others.json")  # the same facts, stated there
+    assert unused_facts([path], others) == ""
+    facts_of(tmp_path / "elsewhere", dict([next(iter(GAINS.items()))]), "others.json")
+    assert "gains.json is not used" in unused_facts([path], others)  # one gain is stated nowhere
     facts.rename(tmp_path / "one.json")
     assert unused_facts([path]) == ""
     facts_of(tmp_path, {"version": 1}, "package.json")
