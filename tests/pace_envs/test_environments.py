@@ -181,7 +181,7 @@ def test_an_episode_that_ends_leaves_the_others_bit_identical():
 
 @pytest.mark.parametrize("integrator", ["implicitfast", "leapfrog"])
 def test_it_steps_in_and_out_of_inference_mode(integrator):
-    """A training with the drives of a model file's fit, whose steps are leapfrogs, ended here after its first rollout."""
+    """A training with a model file's fit, whose steps are leapfrogs, ended after its first rollout."""
     with torch.inference_mode():
         env = short_episodes(integrator=integrator)
         env.reset()
