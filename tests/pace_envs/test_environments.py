@@ -192,6 +192,12 @@ def test_it_steps_in_and_out_of_inference_mode(integrator):
     env.scene["robot"].actuators["servo"].update_encoder_bias(0.1)
 
 
+def test_a_task_of_a_module_that_is_not_imported_says_so():
+    """The message claimed that the module had been imported, which commands alone do."""
+    with pytest.raises(ValueError, match=r"my_arm registered no environment 'Mine-v0'.*In Python, import my_arm first"):
+        load_env_cfg("my_arm:Mine-v0")
+
+
 def test_an_environment_step_must_hold_whole_control_steps():
     cfg = load_env_cfg("Pace-TestBench-v0")
     cfg.scene.robot.actuators["servo"].control_decimation = 2
