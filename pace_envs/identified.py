@@ -206,10 +206,13 @@ def _other_drives(robot: ArticulationCfg, drives: IdentifiedDrives) -> list[str]
                 recorded = drives.drive.get(name, {}).get(joint)
                 if recorded is not None and abs(value - recorded) > _SAME * max(abs(value), abs(recorded)):
                     differs.setdefault((float(recorded), value), []).append(joint)
-        for (recorded, value), joints in differs.items():
+        if differs:
+            pairs = [
+                f"{value:g} and {recorded:g} ({listed(each, _MOST)})" for (recorded, value), each in differs.items()
+            ]
             found.append(
-                f"{name} is {value:g} in this task and was {recorded:g} in the recordings ({listed(joints, _MOST)}). "
-                "Set the task's to the robot's, or to the recordings' if you do not know. [W25]"
+                f"{name} differs between this task and the recordings: {'; '.join(pairs)}. Set the task's to the "
+                "robot's, or to the recordings' if you do not know. [W25]"
             )
     return found
 

@@ -102,8 +102,8 @@ def load_env_cfg(task: str, control_dt: float | None = None, motors: Rows | None
         if module:
             known = ", ".join(name for name in _REGISTERED_BY if registered_by(name)) or "none"
             raise ValueError(
-                f"There is no environment {task!r} after {module} was imported; registered were {known}. Register it "
-                "there with pace_envs.register_task."
+                f"{module} registered no environment {task!r}; registered were {known}. Register it there with "
+                f"pace_envs.register_task. In Python, import {module} first: only commands import it."
             )
         close = difflib.get_close_matches(task, registered_tasks(), n=1)
         hint = f" Did you mean {close[0]!r}?" if close else ""

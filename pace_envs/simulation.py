@@ -404,7 +404,8 @@ class Simulation:
         if middle is not None:
             self.qvel.copy_(middle)
         self.batch.forward(None, stage=mujoco.mjtStage.mjSTAGE_VEL)
-        self._bias = own.clone() if self._frame is None else self._frame.next_bias(self.model)
+        with torch.inference_mode(False):  # it is written outside of a rollout too
+            self._bias = own.clone() if self._frame is None else self._frame.next_bias(self.model)
         self.qvel.copy_(speed)
         self.batch.forward(None, stage=mujoco.mjtStage.mjSTAGE_VEL)
         self.qfrc_applied += own - self._bias

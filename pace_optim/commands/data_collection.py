@@ -33,7 +33,7 @@ def main() -> None:
     torch.set_num_threads(1)  # the physics takes the cores; the tensors are small
     progress = ProgressLine()
     cfg = _cfg_from_args(_parser().parse_args())
-    progress.wait_for("simulating the recordings")
+    progress.wait_for("writing the commands" if cfg.command_only else "simulating the recordings")
     collection = collect(cfg, progress.say)
     progress.close()
     if collection.design is not None:

@@ -136,7 +136,7 @@ def main() -> None:
         print(flush=True)
         run_and_tell(DiagnosisSettings(run=folder, device=device))
     else:
-        print(f"report: {folder / 'report.html'}", *([] if interrupted else next_lines(result, folder)), sep="\n")
+        print(f"report: {folder / 'report.html'}", *next_lines(result, folder), sep="\n")
         print(f"run: {folder}")
 
 

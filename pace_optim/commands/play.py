@@ -17,6 +17,7 @@ from pace_optim.terminal.options import (  # noqa: E402
     number,
     take_common_options,
 )
+from pace_optim.terminal.progress import ProgressLine  # noqa: E402
 
 
 def main() -> None:
@@ -47,17 +48,23 @@ def main() -> None:
     )
     parser.add_argument("--physics_dt", type=number, metavar="S", help="with --replay: step of physics and drives")
     args = take_common_options(vars(parser.parse_args()))
-    run, physics_dt = args.pop("replay"), args.pop("physics_dt")
+    run, physics_dt, progress = args.pop("replay"), args.pop("physics_dt"), ProgressLine()
     if run is not None:
         from pace_optim.run.training_replay import replay_in_training  # as large as all of a fit
 
         training = RunSettings(task=args["task"] or "", identified=run, physics_dt=physics_dt)
-        print(*replay_in_training(run, load_cfg(training) if args["task"] else None).table, sep="\n")
+        progress.wait_for("replaying the recordings")
+        replay = replay_in_training(run, load_cfg(training) if args["task"] else None)
+        progress.close()
+        print(*replay.table, sep="\n")
         return
     if args["checkpoint"] is None:
         raise ValueError("--checkpoint is missing: name a model_<n>.pt or a training's folder, or a fit with --replay.")
     args["command"] = tuple(args["command"]) if args["command"] else None
     args["device"] = args["device"] or "cpu"
+    if not args["viewer"]:
+        progress.wait_for(f"playing {args['num_envs']} robots for {args['seconds']:g} s")
     result = play(PlaySettings(**args))
+    progress.close()
     if result is not None:
         print(*str(result).split("\n"), sep="\n")

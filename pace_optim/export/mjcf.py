@@ -26,6 +26,7 @@ from pace_optim.export.configs import drive_groups
 from pace_optim.export.mjcf_drives import write_drives
 from pace_optim.export.plain_drive import (
     GAIN_EFFECTS,
+    IN_PLAIN_STEPS,
     JOINT_EFFECTS,
     PlainDrive,
     effect_notes,
@@ -139,10 +140,7 @@ def _in_plain_steps(
         joint.armature = max(0.0, joint.armature + more)
     notes = []
     if any(drive.second_order for drive in actuators.values()):
-        notes.append(
-            "kd, delay and armature differ from the identified ones: they compensate for MuJoCo's steps of first order "
-            "and for torques that the drive holds. In such a step the speed is half a step older than the position."
-        )
+        notes.append(IN_PLAIN_STEPS)
     if least:
         notes.append(f"armature or kd of {', '.join(least)} would be below 0: it is 0, and the motion differs.")
     return result, notes

@@ -16,6 +16,7 @@ from pace_optim.export.plain_drive import (
     GAIN_EFFECTS,
     PlainDrive,
     effect_notes,
+    in_plain_steps,
     joint_values,
     plain_drives,
     soft_frictions,
@@ -30,8 +31,9 @@ _START = "# --- the page starts here\n"
 def mjlab_native_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
     """A page that needs mjlab alone: an actuator per joint, with mjlab's delay fields; friction; encoder bias."""
     plain, notes = plain_drives(drives)
-    notes = [*notes, *_notes(drives, plain), *effect_notes(drives, HELD), *link_notes(drives)]
-    calls = [mjlab_actuator(drives, joint, drive) for joint, drive in plain.items()]
+    plain, armatures, changed = in_plain_steps(drives, plain)
+    notes = [*notes, *changed, *_notes(drives, plain), *effect_notes(drives, HELD), *link_notes(drives)]
+    calls = [mjlab_actuator(drives, joint, drive, armatures.get(joint)) for joint, drive in plain.items()]
     values = {
         "_ABOUT_": about(drives, ", for mjlab 1.6 alone", notes),
         "_PHYSICS_DT_": drives.at.physics_dt,
@@ -76,9 +78,9 @@ BESIDE = _BESIDE_
 '''
 
 
-def mjlab_actuator(drives: IdentifiedDrives, joint: str, drive: PlainDrive) -> Call:
+def mjlab_actuator(drives: IdentifiedDrives, joint: str, drive: PlainDrive, armature: float | None) -> Call:
     """The call that makes a joint's actuator, by the class of mjlab that holds this kind of drive."""
-    return Call(name=_class(drive), values=_fields(drives, joint, drive))
+    return Call(name=_class(drive), values=_fields(drives, joint, drive, armature))
 
 
 def _class(drive: PlainDrive) -> str:
@@ -89,7 +91,7 @@ def _class(drive: PlainDrive) -> str:
     return "BuiltinPositionActuatorCfg" if drive.stiffness else "BuiltinVelocityActuatorCfg"
 
 
-def _fields(drives: IdentifiedDrives, joint: str, drive: PlainDrive) -> dict[str, Any]:
+def _fields(drives: IdentifiedDrives, joint: str, drive: PlainDrive, armature: float | None) -> dict[str, Any]:
     values: dict[str, float] = {"stiffness": drive.stiffness} if drive.stiffness or drive.run_dt else {}
     values["damping"] = drive.damping
     if math.isfinite(drive.effort_limit):
@@ -97,8 +99,9 @@ def _fields(drives: IdentifiedDrives, joint: str, drive: PlainDrive) -> dict[str
     if drive.has_line:
         values |= {"stiffness": drive.stiffness, "saturation_effort": drive.saturation_effort}
         values["velocity_limit"] = drive.velocity_limit
-    names = {"armature": "armature", "friction": "frictionloss", "viscous_friction": "viscous_damping"}
-    values |= joint_values(drives, joint, names)
+    if armature is not None:
+        values["armature"] = armature
+    values |= joint_values(drives, joint, {"friction": "frictionloss", "viscous_friction": "viscous_damping"})
     return {
         "target_names_expr": (_expression(joint),),
         **{name: digits(v) for name, v in values.items()},
@@ -136,8 +139,7 @@ def _notes(drives: IdentifiedDrives, plain: Mapping[str, PlainDrive]) -> list[st
         )
     elif 0.0 in rates:
         notes.append("the drive ran continuously (implicit): keep mjlab's integrator implicitfast.")
-    if max(rates, default=0.0) > dt * (1 + 1e-9):
-        notes.append(
-            f"the controller ran every {1e3 * max(rates):.3g} ms: mjlab's runs at each step of {1e3 * dt:g} ms."
-        )
+    held = max((drive.run_dt for drive in plain.values() if not drive.second_order), default=0.0)
+    if held > dt * (1 + 1e-9):
+        notes.append(f"the controller ran every {1e3 * held:.3g} ms: mjlab's runs at each step of {1e3 * dt:g} ms.")
     return notes

@@ -15,6 +15,7 @@ from pace_optim.export.plain_drive import (
     GAIN_EFFECTS,
     PlainDrive,
     effect_notes,
+    in_plain_steps,
     joint_values,
     plain_drives,
     whole_steps_note,
@@ -32,10 +33,12 @@ def newton_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
     torque offset, but where a clamp acts. A spring beside the drive is the joint's.
     """
     plain, notes = plain_drives(drives)
-    notes = [*notes, *_notes(drives, plain), *effect_notes(drives, HELD), *link_notes(drives)]
-    names = {"armature": "armature", "friction": "friction", "viscous_friction": "damping"}
+    plain, armatures, changed = in_plain_steps(drives, plain)
+    notes = [*notes, *changed, *_notes(drives, plain), *effect_notes(drives, HELD), *link_notes(drives)]
+    names = {"friction": "friction", "viscous_friction": "damping"}
     joints = {
-        joint: joint_values(drives, joint, names)
+        joint: ({"armature": armatures[joint]} if joint in armatures else {})
+        | joint_values(drives, joint, names)
         | ({"stiffness": drive.spring, "rest_q": drive.rest} if drive.spring else {})
         for joint, drive in plain.items()
     }
@@ -90,8 +93,11 @@ def _notes(drives: IdentifiedDrives, plain: Mapping[str, PlainDrive]) -> list[st
     rates = {drive.run_dt for drive in plain.values()}
     if 0.0 in rates:
         notes.append("the drive ran continuously (implicit): use Newton's implicit effort mode.")
-    if max(rates, default=0.0) > dt * (1 + 1e-9):
-        notes.append(f"the controller ran every {1e3 * max(rates):.3g} ms: step the actuators at that rate.")
+    held = max((drive.run_dt for drive in plain.values() if not drive.second_order), default=0.0)
+    if any(drive.second_order for drive in plain.values()):
+        notes.append(f"step the actuators with the physics, every {1e3 * dt:.3g} ms.")
+    elif held > dt * (1 + 1e-9):
+        notes.append(f"the controller ran every {1e3 * held:.3g} ms: step the actuators at that rate.")
     notes.append("joint friction: its solver's time constant is the simulation's (MuJoCo's: solreffriction).")
     return notes
 

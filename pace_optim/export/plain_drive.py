@@ -159,6 +159,35 @@ def plain_drives(drives: IdentifiedDrives) -> tuple[dict[str, PlainDrive], list[
     return {joint: result[joint] for joint in drives.joint_names if joint in result}, notes
 
 
+IN_PLAIN_STEPS = (
+    "kd, delay and armature differ from the identified ones: they compensate for MuJoCo's steps of first order "
+    "and for torques that the drive holds. In such a step the speed is half a step older than the position."
+)
+"""Note on drives and armatures that were changed by :meth:`PlainDrive.for_steps_of`."""
+
+
+def in_plain_steps(
+    drives: IdentifiedDrives, plain: Mapping[str, PlainDrive]
+) -> tuple[dict[str, PlainDrive], dict[str, float], list[str]]:
+    """Drives, armatures and a note, for a simulator that runs each drive at every step of the identification.
+
+    A drive that ran continuously acts there within the step, as viscous friction does, unless it has a torque-speed
+    line. An armature that the recordings do not determine is left out.
+    """
+    found, armatures, dt = dict(plain), {}, drives.at.physics_dt
+    for joint, drive in plain.items():
+        more = 0.0
+        if drive.second_order:
+            viscous = drives.determined("viscous_friction", [joint]).get(joint, 0.0)
+            if drive.run_dt or drive.has_line:
+                found[joint], more = drive.for_steps_of(dt, viscous)
+            else:
+                more = -0.5 * (drive.damping + viscous) * dt
+        for armature in drives.determined("armature", [joint]).values():
+            armatures[joint] = max(0.0, armature + more)
+    return found, armatures, [IN_PLAIN_STEPS] if any(drive.second_order for drive in plain.values()) else []
+
+
 def soft_frictions(
     drives: IdentifiedDrives, weights: Mapping[str, float] | None = None, late: Mapping[str, float] | None = None
 ) -> dict[str, tuple[float, float]]:

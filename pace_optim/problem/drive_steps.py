@@ -101,6 +101,9 @@ def check_loops(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> list
 
     Returns:
         A note per recording whose loop is unstable with the armature of the configuration; empty if it is not.
+
+    Raises:
+        ValueError: It is unstable with the largest armature too.
     """
     names = env.scene["robot"].joint_names
     dt = of_joints(env, "_run_dt")
@@ -121,12 +124,12 @@ def check_loops(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> list
             told = (
                 f"the loop of {names[j]} is unstable at its step of {1e3 * dt[j]:g} ms. kd dt / inertia is "
                 f"{kd[j] * dt[j] * felt:.3g} and kp dt² / inertia {kp[j] * dt[j] ** 2 * felt:.3g}, with an armature of "
-                f"{_armature(env, certain)[j]:.3g}. Expected kd dt + kp dt² / 2 below 2 times the inertia. A real "
-                "drive runs its loop faster: set drive_dt or implicit=True in its PaceDCMotorCfg, or correct the gains"
+                f"{_armature(env, certain)[j]:.3g}. Expected kd dt + kp dt² / 2 below 2 times the inertia"
             )
+            cure = "set drive_dt or implicit=True in its PaceDCMotorCfg, or correct the gains."
             if certain:
-                raise ValueError(f"{recording.name}: {told}.")
-            note = f"{told}."
+                raise ValueError(f"{recording.name}: {told}. A real drive runs its loop faster: {cure}")
+            note = f"{told}. A fit seeks larger armatures. If it ends at the least one, the real loop is faster: {cure}"
         notes.append(note)
     return notes
 

@@ -57,7 +57,8 @@ from pace_optim.terminal.choices import DELAY_MODES
 
 _SHORTER = 0.95
 """Commands that come at this part of a control step, or faster, are faster."""
-_NO_GAINS, _STATED_GAINS = "gains: the file has none", "gains: those that the recordings state"
+_STATED_FACTS: dict[str, Literal["stiffness", "effort_limit"]] = {"gains": "stiffness", "effort limit": "effort_limit"}
+"""Facts whose notes on the model file do not hold where all recordings state them."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -392,12 +393,15 @@ class Facts:
                 motors=self.motors,
             )
             facts = replace(facts, logged_rate=True)
-        gains = [note for note in facts.cfg.sim2real.notes if note.startswith(_NO_GAINS) and logs.state_gains]
-        if not logs.held and not logs.note and not gains:
+        stated = {
+            f"{name}: ": f"{name}: as the recordings state" for name, fact in _STATED_FACTS.items() if logs.state(fact)
+        }
+        known = any(note.startswith(tuple(stated)) for note in facts.cfg.sim2real.notes)
+        if not logs.held and not logs.note and not known:
             return facts
         cfg = copy.deepcopy(facts.cfg).holding(logs.held)
         cfg.prepare()
-        said = (_STATED_GAINS if note in gains else note for note in cfg.sim2real.notes)
+        said = (next((new for old, new in stated.items() if note.startswith(old)), note) for note in cfg.sim2real.notes)
         cfg.sim2real.notes = (*said, *filter(None, [logs.note]))
         return replace(facts, cfg=cfg)
 

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
 
@@ -55,11 +55,10 @@ class Logs:
     note: str = ""
     """What is to be said of them."""
 
-    @property
-    def state_gains(self) -> bool:
-        """Whether each states the gains of all its joints."""
-        gains = [each.drive.stiffness for group in self.groups for each in group]
-        return bool(gains) and all(gain is not None and bool(np.isfinite(gain).all()) for gain in gains)
+    def state(self, fact: Literal["stiffness", "effort_limit"]) -> bool:
+        """Whether each states this fact of all its joints."""
+        values = [getattr(each.drive, fact) for group in self.groups for each in group]
+        return bool(values) and all(value is not None and bool(np.isfinite(value).all()) for value in values)
 
     @property
     def command_dt(self) -> float:

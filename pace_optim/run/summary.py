@@ -60,9 +60,14 @@ def summary(result: FitResult) -> list[str]:
 
 
 def above_noise(result: FitResult) -> str:
-    """How far above the noise a fit has ended, where something is missing; else empty."""
+    """How far above the noise a fit has ended, and why; empty near the noise."""
     times = result.times_noise or 0.0
-    return f"{times:.3g} times the measurement noise: something is missing" if times >= ABOVE_NOISE else ""
+    return f"{times:.3g} times the measurement noise: {why_above_noise(result)}" if times >= ABOVE_NOISE else ""
+
+
+def why_above_noise(result: FitResult) -> str:
+    """What an error above the noise shows."""
+    return "the fit was interrupted" if "interrupted" in result.stop_reasons else "something is missing"
 
 
 def few_joints(result: FitResult) -> str:
@@ -96,12 +101,16 @@ def error_line(result: FitResult, of: str = "error, all joints") -> str:
 def next_lines(result: FitResult, folder: Path, *, diagnosed: bool = False) -> list[str]:
     """The commands that come after a fit, by how far its error is above the noise; none if the noise is unknown.
 
+    A fit, or its checks, that was interrupted is resumed first.
+
     Args:
         diagnosed: Whether that is the end of a diagnosis.
     """
+    run = shlex.quote(str(folder))
+    if any("interrupted" in reason for reason in result.stop_reasons):
+        return [f"next: {command('fit')} --resume {run}"]
     if result.times_noise is None and not diagnosed:
         return []
-    run = shlex.quote(str(folder))
     fmt, ending = ("cfg", "drives.py") if result.effects else ("mjcf", "identified.xml")  # MJCF has few effects
     file = shlex.quote(f"{result.robot_name}_{ending}")
     export = f"next: {command('export')} {run} --format {fmt} --output {file}"

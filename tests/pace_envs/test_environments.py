@@ -98,8 +98,9 @@ def test_every_configuration_is_a_fresh_one():
 # ---- episodes
 
 
-def short_episodes(num_envs=3, steps=4, **kwargs) -> ManagerBasedRLEnv:
+def short_episodes(num_envs=3, steps=4, integrator="implicitfast", **kwargs) -> ManagerBasedRLEnv:
     cfg = load_env_cfg("Pace-TestBench-v0")
+    cfg.sim.integrator = integrator
     cfg.episode_length_s, cfg.scene.num_envs = steps * 0.0025, num_envs
     return ManagerBasedRLEnv(cfg, **kwargs)
 
@@ -178,15 +179,23 @@ def test_an_episode_that_ends_leaves_the_others_bit_identical():
     assert ends.episode_length_buf.tolist() == [20, 30, 20]
 
 
-def test_it_steps_in_and_out_of_inference_mode():
+@pytest.mark.parametrize("integrator", ["implicitfast", "leapfrog"])
+def test_it_steps_in_and_out_of_inference_mode(integrator):
+    """A training with a model file's fit, whose steps are leapfrogs, ended after its first rollout."""
     with torch.inference_mode():
-        env = short_episodes()
+        env = short_episodes(integrator=integrator)
         env.reset()
         env.step(torch.zeros(3, 1))
     env.reset(env_ids=[1])
     for _ in range(5):
         env.step(torch.zeros(3, 1))
     env.scene["robot"].actuators["servo"].update_encoder_bias(0.1)
+
+
+def test_a_task_of_a_module_that_is_not_imported_says_so():
+    """The message claimed that the module had been imported, which commands alone do."""
+    with pytest.raises(ValueError, match=r"my_arm registered no environment 'Mine-v0'.*In Python, import my_arm first"):
+        load_env_cfg("my_arm:Mine-v0")
 
 
 def test_an_environment_step_must_hold_whole_control_steps():

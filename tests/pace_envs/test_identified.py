@@ -280,7 +280,7 @@ def test_gains_that_no_file_states_become_the_recordings_unless_the_task_sets_th
     robot.actuators[group].stiffness, robot.actuators[group].damping = {first: 9.0, f"(?!{first}).*": 85.0}, 0.6
     changed(result, drive={"stiffness": dict.fromkeys(JOINTS, 7.0), "damping": dict.fromkeys(JOINTS, 0.3)})
     (doubt,) = [each for each in doubts(cfg, result) if "[W25]" in each]
-    assert doubt.startswith("stiffness is 9 in this task and was 7")
+    assert doubt.startswith("stiffness differs between this task and the recordings: 9 and 7")
     assert f"gains of {len(JOINTS)} joints: the recordings'" in use_identified(cfg, result)[0]
     drive = cfg.scene.robot.actuators[group]
     assert drive.stiffness == {re.escape(j): 9.0 if j == first else 7.0 for j in JOINTS}
@@ -505,8 +505,12 @@ def test_a_sound_result_with_the_tasks_gains_raises_no_doubt(result):
         ({"times_noise": 55.0}, r"ended at 55 times the measurement noise.*pace diagnose"),
         ({"at_bound": ["friction/LF_HAA"]}, r"friction of LF_HAA ended at a bound.*Widen bounds"),
         ({"undetermined": [f"encoder_bias/{j}" for j in JOINTS]}, r"LF_HAA.*and 8 more was not determined"),
-        ({"drive": {"stiffness": {"LF_HAA": 120.0}}}, r"stiffness is 85 in this task and was 120 in the recordings"),
-        ({"drive": {"effort_limit": {"LF_KFE": 40.0}}}, r"effort_limit is 89 .* was 40 .*\(LF_KFE\)"),
+        ({"drive": {"stiffness": {"LF_HAA": 120.0}}}, r"stiffness .*this task and the recordings: 85 and 120 .*LF_HAA"),
+        (
+            {"drive": {"effort_limit": {"LF_HAA": 900.0, "LF_HFE": 500.0, "LF_KFE": 89.0}}},
+            r"recordings: 89 and 900 \(LF_HAA\); 89 and 500 \(LF_HFE\)\. Set",  # an xArm had seven such lines
+        ),
+        ({"drive": {"effort_limit": {"LF_KFE": 40.0}}}, r"effort_limit .*recordings: 89 and 40 \(LF_KFE\)"),
     ],
 )
 def test_what_a_result_is_doubted_for_is_told_before_training(result, changes, said, capsys):

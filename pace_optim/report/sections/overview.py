@@ -13,7 +13,7 @@ from pace_actuators.drive_result import ALL
 from pace_actuators.joint_units import JointType, joint_label, units_for
 from pace_actuators.text import SHOWN, duration, in_short, position_text, position_unit, pretty_unit, three_figures
 from pace_optim.run.result import FitResult
-from pace_optim.run.summary import ABOVE_NOISE, above_noise, few_joints, next_lines
+from pace_optim.run.summary import ABOVE_NOISE, above_noise, few_joints, next_lines, why_above_noise
 
 from ..markup import Section, bullets, folded, html
 from ..run_data import RunData
@@ -55,7 +55,7 @@ def _plain_headline(result: FitResult) -> str:
     times = result.times_noise * errors[ALL] / result.rmse["train"][ALL]
     where = "on held-out data" if result.rmse.get("validation") else "on the training data"
     return (
-        f"{times:.2g} times the noise {where}: something is missing"
+        f"{times:.2g} times the noise {where}: {why_above_noise(result)}"
         if times >= ABOVE_NOISE
         else f"At the noise {where}"
     )

@@ -14,7 +14,8 @@ from places import ROOT
 
 import pace_envs
 from pace_envs.tasks.pace import go2
-from pace_optim.data_collection import Encoder, true_parameters
+from pace_optim.commands import data_collection
+from pace_optim.data_collection import Collection, Encoder, true_parameters
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import load_problem
 from pace_optim.problem.rollout import Rollout
@@ -217,6 +218,18 @@ def test_commands_alone_are_a_csv_that_becomes_a_recording_with_measured_columns
         writer.writerow([*header, *(f"dof_pos/{joint}" for joint in recording.joint_names)])
         writer.writerows(np.column_stack([values, recording.dof_pos]).tolist())
     assert np.array_equal(load_recording(played).des_dof_pos, recording.des_dof_pos)
+
+
+@pytest.mark.parametrize(("option", "said"), [("--command_only", "writing the commands"), ("--no_plot", "simulating")])
+def test_the_progress_of_commands_alone_says_nothing_of_a_simulation(tmp_path, monkeypatch, option, said):
+    shown: list[str] = []
+    monkeypatch.setattr(data_collection.ProgressLine, "wait_for", lambda self, text: shown.append(text))
+    monkeypatch.setattr(
+        data_collection, "collect", lambda cfg, tell: Collection(recordings=(), commands=(), plots=(), warnings=())
+    )
+    monkeypatch.setattr(sys, "argv", ["data-collection", *BENCH, option])
+    data_collection.main()
+    assert [text.startswith(said) for text in shown] == [True]
 
 
 # --- bad input

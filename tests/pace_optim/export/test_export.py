@@ -191,7 +191,7 @@ def test_mjlab_s_own_class_is_that_of_the_drive(result, changes, kind, left_out)
     no_line = {"saturation_effort": np.inf, "velocity_limit": np.inf}
     drive = {"stiffness": 85.0, "damping": 0.6, "effort_limit": 89.0, "run_dt": DT} | no_line | changes
     plain = PlainDrive(**drive, encoder_bias=0.01, delay_s=3.4 * DT)
-    call = mjlab_actuator(IdentifiedDrives.load(result), "LF_HFE", plain)
+    call = mjlab_actuator(IdentifiedDrives.load(result), "LF_HFE", plain, 0.055)
     assert call.name == kind
     given = {name: value for name, value in drive.items() if np.isfinite(value) and name != "run_dt"}
     joint = {"armature": 0.055, "frictionloss": 0.32, "viscous_damping": 0.45}
@@ -199,7 +199,7 @@ def test_mjlab_s_own_class_is_that_of_the_drive(result, changes, kind, left_out)
     names, delay = {"target_names_expr": ("LF_HFE",)}, {"delay_min_lag": 3, "delay_max_lag": 3}
     assert call.values == expected | names | delay
     timing = CommandTiming(interval_s=8 * DT, early_s=0.6 * DT, late_s=2.2 * DT, lost=0.01)
-    call = mjlab_actuator(replace(IdentifiedDrives.load(result), command_timing=timing), "LF_HFE", plain)
+    call = mjlab_actuator(replace(IdentifiedDrives.load(result), command_timing=timing), "LF_HFE", plain, 0.055)
     jitter = {"delay_min_lag": 3, "delay_max_lag": 6, "delay_update_period": 8, "delay_per_env_phase": False}
     assert call.values == expected | names | jitter
 

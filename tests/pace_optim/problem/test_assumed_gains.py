@@ -59,14 +59,15 @@ def test_stated_gains_are_those_that_act(robot):
 
 def test_notes_are_of_what_is_stated(robot):
     """They said what would hold without the facts beside the log and without --drive_dt."""
-    plain, told = recorded(robot), recorded(robot, stiffness=KP, damping=KD)
+    plain, told = recorded(robot), recorded(robot, stiffness=KP, damping=KD, effort_limit=np.array([3.0, 3.0]))
     notes = load_problem(str(robot), data=[told], drive_dt=0.001).env_cfg.sim2real.notes
-    assert "gains: those that the recordings state" in notes
+    assert "gains: as the recordings state" in notes and "effort limit: as the recordings state" in notes
     assert "drive loops: they run every 1 ms, by --drive_dt" in notes
-    assert not any("the file has none" in note or "without it" in note for note in notes)
+    assert not any("the file has none" in note or "without it" in note or "the file's" in note for note in notes)
     recorded(robot)  # the same file without gains
     notes = load_problem(str(robot), data=[plain]).env_cfg.sim2real.notes
-    assert any("the file has none" in note for note in notes) and any("without it" in note for note in notes)
+    for said in ("the file has none", "without it", "1.5 N m (slides: N), the file's"):
+        assert any(said in note for note in notes)
 
 
 def test_gains_that_are_sought_are_no_warning(robot):
@@ -89,3 +90,12 @@ def test_positions_cannot_move_a_drive_that_has_no_position_loop(robot):
     robot.write_text(HEAD.format(SPEEDS))
     with pytest.raises(ValueError, match=r"nothing moves pan, tilt: .*stiffness is 0.*state them beside the log"):
         load_problem(str(robot), data=[path])
+
+
+def test_a_loop_that_is_unstable_with_a_tiny_armature_alone_blames_no_gain(robot):
+    """An xArm's first axis: all facts were right, and the note asked for a faster loop or other gains."""
+    problem = load_problem(str(robot), data=[recorded(robot, stiffness=KP, damping=30 * KD)])
+    (note,) = (note for note in problem.dataset.recordings[0].notes if "unstable" in note)
+    assert "A fit seeks larger armatures. If it ends at the least one, the real loop is faster" in note
+    armature = problem.env_cfg.sim2real.bounds["armature"]
+    assert (armature[:, 0] > 0.01 * armature[:, 1]).any()  # it does

@@ -5,6 +5,7 @@ import io
 import sys
 import time
 import warnings
+from types import SimpleNamespace
 
 import pytest
 
@@ -136,3 +137,23 @@ def test_a_command_that_simulates_shows_it(monkeypatch, tmp_path, verb, work, wo
     with pytest.raises(DoneError):
         module.main()
     assert stream.getvalue().startswith("simulating the recordings")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--replay", "run"], ["replaying the recordings"]),
+        (["--checkpoint", "model_0.pt", "--num_envs", "16"], ["playing 16 robots for 20 s"]),
+        (["--checkpoint", "model_0.pt", "--viewer"], []),
+    ],
+)
+def test_play_is_not_silent_unless_a_window_shows_it(monkeypatch, options, said):
+    """With the fine steps of a model file's fit, 256 robots took four minutes without a line."""
+    monkeypatch.setenv("DISPLAY", ":0")
+    command, shown = importlib.import_module("pace_optim.commands.play"), []
+    monkeypatch.setattr(command.ProgressLine, "wait_for", lambda self, text: shown.append(text))
+    monkeypatch.setattr(command, "replay_in_training", lambda run, cfg: SimpleNamespace(table=[]))
+    monkeypatch.setattr(command, "play", lambda settings: None)
+    monkeypatch.setattr(sys, "argv", ["play", *options])
+    command.main()
+    assert shown == said
