@@ -18,7 +18,6 @@ from pace_optim.joints.simulation.joint_load import JointLoad, LinkChange, Links
 from pace_optim.problem.free_phases import FreePhases
 from pace_optim.problem.problem import Problem
 from pace_optim.recording import Recording
-from pace_optim.recording.carried import Carried
 from pace_optim.recording.dataset import Dataset
 from pace_optim.recording.noise import noise_floor
 
