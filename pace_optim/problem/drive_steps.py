@@ -152,7 +152,7 @@ def _pull(env: ManagerBasedRLEnv, recording: Recording) -> np.ndarray:
     return np.where(dt > 0, kd * dt + 0.5 * kp * dt**2, 0.0)
 
 
-def loop_gains(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> tuple[np.ndarray, np.ndarray]:
+def loop_gains(env: ManagerBasedEnv, recordings: Sequence[Recording]) -> tuple[np.ndarray, np.ndarray]:
     """Stiffness [N m/rad] and damping [N m s/rad] of each joint's loop, means of the recordings', (n,) each."""
     kp = [_stated(each.drive.stiffness, of_joints(env, "stiffness")) for each in recordings]
     kd = [_stated(each.drive.damping, of_joints(env, "damping")) for each in recordings]
