@@ -63,12 +63,13 @@ def drive_loads(problem: Problem, evaluator: Evaluator, encoder_bias: np.ndarray
         τ = kp (q* − q) + kd (q̇* − q̇) + τ_ff
 
     Args:
+        problem: Its recordings state the drives, with gains that were unknown as found.
         evaluator: Its environments hold each recording's load.
         encoder_bias: Of each joint, (n,) [rad].
     """
     rollout, configured = evaluator.rollout(1), configured_drive(problem)
     result = []
-    for r, recording in enumerate(rollout.dataset.recordings):
+    for r, recording in enumerate(problem.dataset.recordings):
         dt = float(np.median(np.diff(recording.time)))
         position = smoothed(recording.dof_pos, dt)
         speed = np.gradient(position, dt, axis=0)

@@ -22,7 +22,7 @@ from pace_optim.identification.fit import fit
 from pace_optim.joints.fits.fits import fits_on
 from pace_optim.joints.fits.model import labels, whole_values
 from pace_optim.problem.problem import Problem
-from pace_optim.problem.unknown_facts import started_from, with_identified
+from pace_optim.problem.unknown_facts import started_from
 from pace_optim.report import check_folder, report_text
 from pace_optim.run.open import Run
 from pace_optim.run.result import FitResult
@@ -76,7 +76,8 @@ def diagnose(
     wrong = LinkFindings()
     if settings.links and not whole.joints_stand_alone:  # there an effect on the joint says the same
         wrong = find_wrong_links(whole, whole.space.from_dict(values), progress.say, cfg=settings.cfg)
-    problem = _as_found(whole, result).with_effects(()).with_links(wrong.links).on_positions()
+    problem = whole.as_found(result.parameters, result.undetermined)
+    problem = problem.with_effects(()).with_links(wrong.links).on_positions()
     base = {name: (wrong.values or values)[name] for name in problem.space.slices}
     off = any(r.torque_enable is not None and not r.torque_enable.all() for r in problem.dataset.recordings)
     candidates = candidate_effects(settings.effects, only=settings.only, switched_off=off)
@@ -123,14 +124,6 @@ def diagnose(
 def _stands(tried: Findings, found: Findings, run: FitResult, refit: FitResult) -> bool:
     """Whether a fit of the whole robot is the diagnosis' own: of hints on trial, if one has become a name."""
     return tried is found or bool(as_refitted(tried, run, refit).named.keys() - found.named.keys())
-
-
-def _as_found(problem: Problem, result: FitResult) -> Problem:
-    """The problem with unknown gains and limits as the run found them."""
-    told = with_identified(
-        problem.plain_cfg, problem.dataset.recordings, problem.unknown, result.parameters, result.undetermined
-    )
-    return replace(problem, dataset=replace(problem.dataset, recordings=tuple(told)))
 
 
 def _own_effects(problem: Problem, result: FitResult) -> list[EffectCfg]:

@@ -119,7 +119,7 @@ class WayDown:
 
     def near(self, x: torch.Tensor, cfg: LeastSquaresCfg) -> Descent:
         """Descend on the whole recordings from a vector that is known to be near the best."""
-        if not self.descents:
+        if not self.is_on_whole:
             self.descents.append(Descent(x=x, stage=self.stages[1]))
         return self._descend(self.stages[1], cfg)
 

@@ -130,7 +130,7 @@ def conclude(
         if not keep_interrupted:
             raise
         end = replace(end, stop_reasons=(*end.stop_reasons, CHECKS_INTERRUPTED))
-    _write_drives(run, end.way, end.x)
+    _write_drives(run, end.way, end.x, end.left_open)
     return _write(run, record, end, checked=True)
 
 
@@ -142,10 +142,10 @@ def _write(run: Optimization, record: EnvironmentRecord, end: _End, checked: boo
     return result
 
 
-def _write_drives(run: Optimization, way: WayDown, x: torch.Tensor) -> None:
-    space = way.problem.space
-    bias = space.to_physical(x)[space["encoder_bias"]].numpy()
-    run.folder.write_json("drives.json", drive_loads(way.problem, way.assessor, bias))
+def _write_drives(run: Optimization, way: WayDown, x: torch.Tensor, left_open: Sequence[str] = ()) -> None:
+    space, physical = way.problem.space, way.problem.space.to_physical(x)
+    known, bias = way.problem.as_found(space.to_dict(physical), left_open), physical[space["encoder_bias"]].numpy()
+    run.folder.write_json("drives.json", drive_loads(known, way.assessor, bias))
 
 
 def _of_run(run: Optimization, record: EnvironmentRecord) -> dict[str, Any]:

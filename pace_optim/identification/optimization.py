@@ -202,7 +202,7 @@ class Optimization:
         above = [joint for joint, value in noise.items() if value > _STEP_IN_DOUBT * floor.get(joint, np.inf)]
         if not above or not self._may_halve:
             return None
-        finer = self._way_at_half_the_step()
+        finer = self._way_at_half_the_step("step")
         end = finer.begin([x])
         left = self._torque_noise(finer.pieces, end.x)
         if not any(left[joint] < _OF_TORQUES * noise[joint] for joint in above):
@@ -217,9 +217,9 @@ class Optimization:
         """Whether the physics step may be halved once more."""
         return self.settings.physics_dt is None and self._halvings < _HALVINGS
 
-    def _way_at_half_the_step(self) -> WayDown:
+    def _way_at_half_the_step(self, name: str) -> WayDown:
         finer = self.problem.with_physics_dt(self.problem.physics_dt / 2)
-        return self._way(finer, f"step of {finer.physics_dt:g} s")
+        return self._way(finer, f"{name} of {finer.physics_dt:g} s")
 
     def _torque_noise(self, evaluator: Evaluator, x: torch.Tensor) -> dict[str, float]:
         """What torques leave at a normalised vector (size,), by joint [N m]."""
@@ -339,7 +339,7 @@ class Optimization:
 
     def with_loop(self, period: float, x: torch.Tensor) -> Outcome:
         """Go on with loops of another period [s], near where a fit of pieces with it ends, normalised (size,)."""
-        other = self._way(self.problem.with_loop(period), f"loop of {period:g} s")
+        other = self._way(self.problem.with_loop(period), f"checked loop of {period:g} s")
         return self._ended(other, other.near(x, NEAR))
 
     def at_half_the_step(self, x: torch.Tensor, there: Residuals, change: torch.Tensor | None) -> Outcome | None:
@@ -358,7 +358,7 @@ class Optimization:
         if score <= _STEP_IN_DOUBT**2 * noise or of_step <= _OF_THE_STEP * (score - noise):
             return None
         self._halvings += 1
-        finer = self._way_at_half_the_step()
+        finer = self._way_at_half_the_step("checked step")
         self.progress.say(f"the physics step shows: going on with one of {_ms(finer)}")
         end = finer.near(x, NEAR)
         return self._ended(finer, end) if end.score < score else None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -47,7 +47,14 @@ from pace_optim.problem.log_and_robot import (
 from pace_optim.problem.moving_base import BasePath, base_path, on_moving_base
 from pace_optim.problem.parameter_space import Colouring, ParameterSpace, colour
 from pace_optim.problem.recordings import Logs, conform_all, motors_of_logs, read_logs, tell_on_stderr
-from pace_optim.problem.unknown_facts import GAINS, LIMITS, lift_limits, refined_limits, with_unknown
+from pace_optim.problem.unknown_facts import (
+    GAINS,
+    LIMITS,
+    lift_limits,
+    refined_limits,
+    with_identified,
+    with_unknown,
+)
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import Dataset, Torques, make_dataset
 from pace_optim.recording.parts import affordable
@@ -224,6 +231,11 @@ class Problem:
         longest = plain.sim.dt
         finest = longest / max(1, math.ceil(longest / (physics_dt or self.physics_dt) * (1 - 1e-9)))
         return replace(self, plain_cfg=plain, env_cfg=_configured(plain, finest, self.env_cfg.sim2real.effects))
+
+    def as_found(self, parameters: Mapping[str, Mapping[str, float]], undetermined: Iterable[str]) -> Problem:
+        """The same with unknown gains and limits as a fit found them, where its recordings determine them."""
+        told = with_identified(self.plain_cfg, self.dataset.recordings, self.unknown, parameters, undetermined)
+        return replace(self, dataset=replace(self.dataset, recordings=tuple(told)))
 
     def seeking(self, links: Sequence[Reference]) -> Problem:
         """The same with the inertial parameters of these links identified."""

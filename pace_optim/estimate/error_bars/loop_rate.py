@@ -158,7 +158,7 @@ def loop_rates(
     """Compare the rates that the loops may have, at a fit with one of them.
 
     All are simulated with one physics step and fitted again, by the fit's derivatives as long as they serve. Each
-    begins at the end of the one nearest to it, or where a later loop moves that, whichever is better. Residuals and
+    begins at the end of the one nearest to it, or, if that is better, where a later loop moves this end. Residuals and
     values between the shortest simulated periods follow by the polynomial through these. With r the residuals of a
     candidate and d = r - r' their difference to the best one's,
 
@@ -264,7 +264,7 @@ def _refitted(
     """
     evaluator, space = other.evaluator_like(problem), problem.space
     evaluator.phases = phases
-    starts = (x, _with_longer_period(evaluator, x, longer))
+    starts = (x, _with_longer_period(evaluator, x, longer)) if longer else (x,)
     begins = [evaluator.residuals(space.to_physical(each)[None]) for each in starts]
     best = int(torch.cat([each.score for each in begins]).nan_to_num(nan=math.inf).argmin())
     x, begin = starts[best], begins[best]

@@ -11,7 +11,16 @@ from markupsafe import Markup
 
 from pace_actuators.drive_result import ALL
 from pace_actuators.joint_units import JointType, joint_label, units_for
-from pace_actuators.text import SHOWN, duration, in_short, position_text, position_unit, pretty_unit, three_figures
+from pace_actuators.text import (
+    SHOWN,
+    duration,
+    in_short,
+    position_text,
+    position_unit,
+    pretty_unit,
+    three_figures,
+    with_table,
+)
 from pace_optim.run.result import FitResult
 from pace_optim.run.summary import ABOVE_NOISE, above_noise, few_joints, next_lines, why_above_noise
 
@@ -181,10 +190,10 @@ def _warnings(result: FitResult) -> Markup:
 
 def _with_table(warning: str) -> Markup:
     """A warning, with the table and the line to copy below it that some have."""
-    sentence, _, lines = warning.partition("\n")
-    rows, _, line = dedent(lines).rpartition("\n")
+    sentence, *table = with_table(warning)
+    *rows, line = dedent("\n".join(table)).split("\n")
     text = '{{ sentence }}{% if line %}<pre class="rows">{{ rows }}</pre><pre>{{ line }}</pre>{% endif %}'
-    return html(text, sentence=sentence, rows=rows, line=line)
+    return html(text, sentence=sentence, rows="\n".join(rows), line=line)
 
 
 def _errors_by_joint(result: FitResult) -> Markup:

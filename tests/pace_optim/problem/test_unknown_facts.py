@@ -8,7 +8,7 @@ import pytest
 from bench_recordings import Bench, chirp, record
 
 from pace_actuators import PaceDCMotorCfg
-from pace_optim.diagnosis.diagnose import _as_found
+from pace_optim.comparison.drive_loads import drive_loads
 from pace_optim.identification.fit import fit
 from pace_optim.problem.problem import load_problem
 from pace_optim.problem.unknown_facts import identified_gains, started_from, with_identified
@@ -51,6 +51,16 @@ def test_a_run_knows_what_was_unknown_and_a_drive_has_what_was_found(run):
     assert problem.unknown == ("stiffness", "damping") and problem.effects == result.effects
     drive = PaceDCMotorCfg.from_result(folder, stiffness=20.0, damping=0.6)
     assert {cfg.effect_class.name for cfg in drive.effects} == {"proportional_gain", "derivative_gain"}
+
+
+def test_the_drives_of_a_run_ask_with_the_gains_that_were_found(run):
+    """drives.json states what was asked of each drive: with the assumed gains, half of it."""
+    result, folder = run
+    problem = open_problem(folder)
+    asked = [each["joints"]["servo"]["asked_peak"] for each in json.loads((folder / "drives.json").read_text())]
+    stated = drive_loads(problem, problem.evaluator(), np.array([result.parameters["encoder_bias"]["servo"]]))
+    for peak, each in zip(asked, stated, strict=True):
+        assert peak == pytest.approx(2.0 * each["joints"]["servo"]["asked_peak"], rel=0.1)
 
 
 def test_the_gains_themselves_are_told_where_they_are_one_set(run, soft):
@@ -142,7 +152,7 @@ def test_a_diagnosis_begins_with_the_gains_that_were_found(run):
     """The base model is as good with them as the fit was; with the stated ones it is not."""
     result, folder = run
     stated = open_problem(folder, effects=())
-    found = _as_found(stated, result)
+    found = stated.as_found(result.parameters, result.undetermined)
     for before, now in zip(stated.dataset.recordings, found.dataset.recordings, strict=True):
         gain = result.parameters["proportional_gain.gain"]["servo"]
         assert now.drive.stiffness[0] == pytest.approx(gain * before.drive.stiffness[0])

@@ -115,5 +115,5 @@ def test_a_fit_goes_on_at_a_finer_step_where_its_step_shows(tmp_path):
     settings = FitSettings(task=BENCH, optimizer="least_squares", log_dir=str(tmp_path))
     run = Optimization(settings, problem, RunFolder(tmp_path), ProgressLine())
     result = conclude(run, EnvironmentRecord.of(BENCH, problem.env_cfg), run.run())
-    assert [each.stage for each in run.descents] == ["pieces", "whole", "step of 0.00125 s, whole"]
+    assert [each.stage for each in run.descents] == ["pieces", "whole", "checked step of 0.00125 s, whole"]
     assert result.physics_dt == 0.00125 and run.ended.score < 0.5 * run.descents[1].score

@@ -135,7 +135,7 @@ def test_every_bound_is_kept_and_little_is_lost_by_it():
         ("frozen_1s", "of elbow is frozen from 2 to 2.997 s"),
         ("dead_encoder", "of elbow never changes"),
         ("motor_side", "gear of 9"),
-        ("torque_saturates_unstated", "torque of shoulder ends at"),
+        ("torque_saturates_unstated", "torque of shoulder, elbow ends below"),
         ("on_side", "gravity points along"),
     ],
 )
