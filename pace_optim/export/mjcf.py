@@ -26,12 +26,12 @@ from pace_optim.export.configs import drive_groups
 from pace_optim.export.mjcf_drives import write_drives
 from pace_optim.export.plain_drive import (
     GAIN_EFFECTS,
-    IN_PLAIN_STEPS,
     JOINT_EFFECTS,
     PlainDrive,
     effect_notes,
     joint_values,
     plain_drives,
+    plain_step_notes,
     soft_frictions,
 )
 
@@ -138,12 +138,7 @@ def _in_plain_steps(
         if joint.armature + more < 0 or drive.damping > 0 == result[name].damping:
             least.append(name)
         joint.armature = max(0.0, joint.armature + more)
-    notes = []
-    if any(drive.second_order for drive in actuators.values()):
-        notes.append(IN_PLAIN_STEPS)
-    if least:
-        notes.append(f"armature or kd of {', '.join(least)} would be below 0: it is 0, and the motion differs.")
-    return result, notes
+    return result, plain_step_notes(actuators, least)
 
 
 def _write_soft_friction(

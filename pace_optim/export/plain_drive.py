@@ -159,11 +159,10 @@ def plain_drives(drives: IdentifiedDrives) -> tuple[dict[str, PlainDrive], list[
     return {joint: result[joint] for joint in drives.joint_names if joint in result}, notes
 
 
-IN_PLAIN_STEPS = (
+_IN_PLAIN_STEPS = (
     "kd, delay and armature differ from the identified ones: they compensate for MuJoCo's steps of first order "
     "and for torques that the drive holds. In such a step the speed is half a step older than the position."
 )
-"""Note on drives and armatures that were changed by :meth:`PlainDrive.for_steps_of`."""
 
 
 def in_plain_steps(
@@ -174,7 +173,7 @@ def in_plain_steps(
     A drive that ran continuously acts there within the step, as viscous friction does, unless it has a torque-speed
     line. An armature that the recordings do not determine is left out.
     """
-    found, armatures, dt = dict(plain), {}, drives.at.physics_dt
+    found, armatures, least, dt = dict(plain), {}, [], drives.at.physics_dt
     for joint, drive in plain.items():
         more = 0.0
         if drive.second_order:
@@ -185,7 +184,22 @@ def in_plain_steps(
                 more = -0.5 * (drive.damping + viscous) * dt
         for armature in drives.determined("armature", [joint]).values():
             armatures[joint] = max(0.0, armature + more)
-    return found, armatures, [IN_PLAIN_STEPS] if any(drive.second_order for drive in plain.values()) else []
+            if armature + more < 0 or drive.damping > 0 == found[joint].damping:
+                least.append(joint)
+    return found, armatures, plain_step_notes(plain, least)
+
+
+def plain_step_notes(plain: Mapping[str, PlainDrive], least: Sequence[str]) -> list[str]:
+    """What changes where drives act in steps of first order.
+
+    Args:
+        plain: The drives.
+        least: Those whose armature or kd would be below 0.
+    """
+    notes = [_IN_PLAIN_STEPS] if any(drive.second_order for drive in plain.values()) else []
+    if least:
+        notes.append(f"armature or kd of {', '.join(least)} would be below 0: it is 0, and the motion differs.")
+    return notes
 
 
 def soft_frictions(

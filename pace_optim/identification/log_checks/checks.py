@@ -376,14 +376,17 @@ def lifted_limits(evidence: Evidence) -> Iterator[Change]:
     for j in _of_known_gains(evidence):
         given, asked = view.given(j), view.asked(j)
         if np.mean(np.abs(given - asked) > 1e-6 * np.abs(asked)) > _SHARE:
-            yield Change(
-                joints=(j,),
-                view=_without_limits(view, j),
-                text="{joints} give what the gains ask for, which is beyond the stated limit. State the real "
-                "effort_limit in the facts (--facts FILE, or NAME.json beside the log): it replaces the model's and "
-                "widens the bounds. If you do not know it, use the line below, which no longer cuts this motion.",
-                limit=(_limits_of(view, j), float(np.abs(asked).max())),
-            )
+            begin, limit = "{joints} give what the gains ask for, which is beyond the stated ", None
+            where = "in the facts (--facts FILE, or NAME.json beside the log)"
+            if np.isfinite(view.saturation_effort[j]) and np.isfinite(view.velocity_limit[j]):
+                text = f"{begin}torque-speed line. State the real saturation_effort and velocity_limit {where}."
+            else:
+                limit = _limits_of(view, j), float(np.abs(asked).max())
+                text = (
+                    f"{begin}limit. State the real effort_limit {where}: it replaces the model's and widens the "
+                    "bounds. If you do not know it, use the line below, which no longer cuts this motion."
+                )
+            yield Change(joints=(j,), view=_without_limits(view, j), text=text, limit=limit)
 
 
 def _without_limits(view: View, j: int) -> View:
