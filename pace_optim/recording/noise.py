@@ -16,15 +16,11 @@ _SEGMENT = 128
 _FEWEST_SAMPLES = 64
 _QUIET = 0.25
 _LARGEST_CORRELATION = 0.6
+_STEEPEST = 2.1
+"""First-order noise falls by less than 2 over the upper half of the frequencies; what falls more is motion's tail."""
 _ABOVE = 1.5
-"""A spectrum this many times the noise's is motion ..."""
-_WINDOW = 8
-"""... in the median over so many frequencies."""
-_LEAST_REACH = 0.3
-"""Part of the Nyquist frequency down to which noise must reach to show a correlation: the tail of a motion has one."""
+"""A spectrum this many times the noise's is motion."""
 _MOST_STEPS = 50
-_OFF = 0.1
-"""RMS by which differences may miss a multiple of the lattice's step, in steps; of any positions it is 1/√12."""
 _NUMERICAL = 1e-9
 _VARIANCES: WeakKeyDictionary[Recording, float] = WeakKeyDictionary()
 LEAST_NOISE = 1e-7
@@ -98,8 +94,6 @@ def with_repetitions(floors: Sequence[NoiseFloor], positions: Sequence[np.ndarra
 def lattice_step(position: np.ndarray) -> float | None:
     """The step δ of which all differences between positions are multiples; ``None`` without one.
 
-    Positions that were printed with few digits lie beside their lattice.
-
     Args:
         position: (K,) [rad].
     """
@@ -107,12 +101,12 @@ def lattice_step(position: np.ndarray) -> float | None:
     steps = steps[steps > 1e-7]
     if len(steps) < 10:
         return None
-    smallest = float(np.mean(steps[steps < 1.5 * steps.min()]))
+    smallest = float(np.median(steps[steps < 1.2 * steps.min()]))
     near = steps[steps < _MOST_STEPS * smallest]
     count = np.round(near / smallest)
-    step = float(near.sum() / count.sum())
-    off = np.sqrt(np.mean((near / step - count) ** 2))
-    return step if len(near) >= max(10, 0.2 * len(steps)) and off < _OFF else None
+    if len(near) < max(10, 0.2 * len(steps)) or np.mean(np.abs(near / smallest - count) < 0.08) < 0.98:
+        return None
+    return float(near.sum() / count.sum())
 
 
 def _spectral_sigma(position: np.ndarray, dt: float) -> float:
@@ -120,10 +114,8 @@ def _spectral_sigma(position: np.ndarray, dt: float) -> float:
 
     Noise x_k = ρ x_{k-1} + s w_k has the spectrum S(ω) ∝ s² / (1 − 2ρ cos ω + ρ²) with ω = 2π f dt. ρ and s are fitted
     from the Nyquist frequency down to where motion begins; below, the spectrum is the lower of this one and the
-    measured. Where motion reaches into the upper frequencies, its tail looks like ρ: noise is then white, at the level
-    of the highest frequencies. Noise is in every segment and motion is not, so the measured spectrum is the lower
-    quarter over segments of a third of a second, brought to the mean by the exponential distribution that noise has:
-    − ln(1 − 1/4).
+    measured. Noise is in every segment and motion is not, so the measured spectrum is the lower quarter over segments
+    of a third of a second, brought to the mean by the exponential distribution that noise has: − ln(1 − 1/4).
     """
     if len(position) < _FEWEST_SAMPLES:
         return _difference_sigma(position)
@@ -133,8 +125,7 @@ def _spectral_sigma(position: np.ndarray, dt: float) -> float:
     frequency, _, segments = signal.spectrogram(
         whitened, 1 / dt, window="hann", nperseg=segment, noverlap=segment // 2, detrend=False, mode="psd"
     )
-    quiet = np.quantile(segments, _QUIET, axis=1, method="weibull")  # unbiased with few segments too
-    density = quiet / -np.log(1 - _QUIET)
+    density = np.quantile(segments, _QUIET, axis=1) / -np.log(1 - _QUIET)
     omega = 2 * np.pi * frequency * dt
     keep = slice(1, -1)  # the ends are estimated from half as many numbers
     omega, width = omega[keep], float(frequency[1] - frequency[0])
@@ -142,15 +133,14 @@ def _spectral_sigma(position: np.ndarray, dt: float) -> float:
     if density.max() * width < _NUMERICAL**2:
         return float(np.sqrt(density.sum() * width))
     start = len(omega) // 2
+    quarter = start // 4
+    if np.mean(density[start : start + quarter]) > _STEEPEST * np.mean(density[-quarter:]):
+        return float(np.sqrt(np.minimum(np.mean(density[-quarter:]), density).sum() * width))
     noise = _FirstOrderSpectrum(omega[start:], density[start:])
-    while start > 2:
-        window = slice(max(start - _WINDOW, 0), start)
-        if np.median(density[window] / noise(omega[window])) >= _ABOVE:
-            break
+    while start > 2 and np.median(density[start - 3 : start] / noise(omega[start - 3 : start])) < _ABOVE:
         start -= 1
-        noise = _FirstOrderSpectrum(omega[start:], density[start:])
-    level = noise(omega) if start <= _LEAST_REACH * len(omega) else np.mean(density[-_WINDOW:])
-    return float(np.sqrt(np.minimum(level, density).sum() * width * len(frequency) / len(omega)))
+    noise = _FirstOrderSpectrum(omega[start:], density[start:])
+    return float(np.sqrt(np.minimum(noise(omega), density).sum() * width * len(frequency) / len(omega)))
 
 
 class _FirstOrderSpectrum:
@@ -161,7 +151,7 @@ class _FirstOrderSpectrum:
         flat = [density * self._inverse(omega, rho) for rho in choices]
         spread = [float(np.var(np.log(np.maximum(ratio, 1e-300)))) for ratio in flat]
         best = int(np.argmin(spread))
-        self._rho, self._level = float(choices[best]), float(np.median(flat[best]))
+        self._rho, self._level = float(choices[best]), float(np.mean(flat[best]))
 
     def __call__(self, omega: np.ndarray) -> np.ndarray:
         return self._level / self._inverse(omega, self._rho)

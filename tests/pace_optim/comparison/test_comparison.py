@@ -112,39 +112,6 @@ def test_a_quantised_encoder_is_never_below_its_lattice(bits):
     assert noise_floor(slow, DT).sigma >= step / np.sqrt(12) * (1 - 1e-9)
 
 
-def servo_motion(seed, amplitude, dt, seconds=20):
-    """A servo of 5 Hz with dry friction follows commands that come at 50 Hz: its motion has kinks."""
-    draw, fine = rng(seed), 1e-3
-    time = np.floor(np.arange(0, seconds, fine) / 0.02 + 1e-9) * 0.02
-    frequency, phase = draw.uniform(0.1, 2.5, 6), draw.uniform(0, 2 * np.pi, 6)
-    command = (amplitude * np.sin(2 * np.pi * frequency * time[:, None] + phase) / np.sqrt(frequency)).sum(axis=1)
-    position, speed, omega, result = command[0], 0.0, 2 * np.pi * 5, []
-    for target in command.tolist():
-        result.append(position)
-        speed += fine * (omega**2 * (target - position) - 1.4 * omega * speed)
-        speed = max(abs(speed) - fine * 10 * amplitude, 0.0) * (1 if speed > 0 else -1)
-        position += fine * speed
-    return np.array(result)[:: round(dt / fine)]
-
-
-@pytest.mark.parametrize("bits", [12, 14])
-@pytest.mark.parametrize(("dt", "amplitude"), [(0.02, 0.003), (0.02, 0.03), (0.02, 0.3), (0.005, 0.003), (0.005, 0.3)])
-def test_rounding_and_white_noise_are_measured_through_a_servos_motion_slow_or_fast(bits, dt, amplitude):
-    step, rounded, white = 2 * np.pi / 2**bits, [], []
-    for seed in range(2):
-        motion = servo_motion(seed, amplitude, dt)
-        rounded.append(noise_floor(np.round(motion / step) * step, dt).sigma)
-        noise = step / np.sqrt(12) * rng(seed).standard_normal(len(motion))
-        white.append(noise_floor(motion + noise, dt).sigma)
-    assert rounded == pytest.approx([step / np.sqrt(12)] * 2, rel=0.25)
-    assert white == pytest.approx([step / np.sqrt(12)] * 2, rel=0.25)
-
-
-def test_a_lattice_that_was_printed_with_few_digits_is_found():
-    degrees = np.round(np.degrees(np.round(CHIRP / (2 * np.pi / 4096)) * 2 * np.pi / 4096), 2)
-    assert lattice_step(np.radians(degrees)) == pytest.approx(2 * np.pi / 4096, rel=1e-3)
-
-
 def test_a_lattice_stored_in_single_precision_is_found_and_a_smooth_motion_has_none():
     step = 2 * np.pi / 2**14
     single = (np.round(CHIRP / step) * step).astype(np.float32).astype(float)
