@@ -11,6 +11,20 @@ from pace_optim.run.summary import error_line, next_lines, summary
 from pace_optim.terminal.choices import MEASURED_FACTS
 from pace_optim.terminal.cli import make_parser
 from pace_optim.terminal.options import add_common_options, add_device_option, add_several, number, take_common_options
+from pace_optim.terminal.progress import ProgressLine
+
+_SHARES = {
+    "fitting the base": 0.08,
+    "looking for effect 1": 0.17,
+    "fitting .* on windows": 0.23,
+    "fitting .* on whole recordings": 0.38,
+    "simulating the whole robot": 0.45,
+    "trying replacements": 0.65,
+    "leaving out": 0.72,
+    "fitting curves": 0.75,
+    "fitting the whole robot": 0.8,
+}
+"""Part of a diagnosis' time that has passed where a step begins: medians of 8 diagnoses of 7 robots."""
 
 
 def main() -> None:
@@ -45,7 +59,9 @@ def main() -> None:
 
 def run_and_tell(settings: DiagnosisSettings) -> None:
     """Diagnose; print one line before the robot is fitted again, then that fit, the verdict and what to do next."""
-    diagnosis = diagnose(settings, on_verdict=lambda found: print(first_line(found), flush=True))
+    progress = ProgressLine()
+    progress.expect(_SHARES)
+    diagnosis = diagnose(settings, progress, on_verdict=lambda found: print(first_line(found), flush=True))
     first, last = Path(diagnosis.runs[0]), Path(diagnosis.runs[-1])
     if not first.is_absolute() and last.is_relative_to(Path.cwd()):  # as the run was named
         last = last.relative_to(Path.cwd())

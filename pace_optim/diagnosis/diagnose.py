@@ -30,19 +30,6 @@ from pace_optim.terminal.choices import UNKNOWN_FACTS
 from pace_optim.terminal.cli import command
 from pace_optim.terminal.progress import ProgressLine
 
-_SHARES = {
-    "fitting the base": 0.08,
-    "looking for effect 1": 0.17,
-    "fitting .* on windows": 0.23,
-    "fitting .* on whole recordings": 0.38,
-    "simulating the whole robot": 0.45,
-    "trying replacements": 0.65,
-    "leaving out": 0.72,
-    "fitting curves": 0.75,
-    "fitting the whole robot": 0.8,
-}
-"""Part of a diagnosis' time that has passed where a step begins: medians of 8 diagnoses of 7 robots."""
-
 
 def diagnose(
     settings: DiagnosisSettings,
@@ -62,7 +49,6 @@ def diagnose(
     """
     begin = time.monotonic()
     progress = progress or ProgressLine()
-    progress.expect(_SHARES)
     progress.wait_for("reading the run and its recordings")
     run = Run.open(settings.run, settings.task)
     folder = run.folder

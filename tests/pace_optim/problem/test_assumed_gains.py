@@ -66,7 +66,7 @@ def test_notes_are_of_what_is_stated(robot):
     assert not any("the file has none" in note or "without it" in note or "the file's" in note for note in notes)
     recorded(robot)  # the same file without gains
     notes = load_problem(str(robot), data=[plain]).env_cfg.sim2real.notes
-    for said in ("the file has none", "without it", "1.5 N m (slides: N), the file's"):
+    for said in ("the file has none", "without it", "1.5 N m, the file's"):
         assert any(said in note for note in notes)
 
 

@@ -152,7 +152,8 @@ def test_play_is_not_silent_unless_a_window_shows_it(monkeypatch, options, said)
     monkeypatch.setenv("DISPLAY", ":0")
     command, shown = importlib.import_module("pace_optim.commands.play"), []
     monkeypatch.setattr(command.ProgressLine, "wait_for", lambda self, text: shown.append(text))
-    monkeypatch.setattr(command, "replay_in_training", lambda run, cfg: SimpleNamespace(table=[]))
+    replay = "pace_optim.run.training_replay.replay_in_training"
+    monkeypatch.setattr(replay, lambda run, cfg: SimpleNamespace(table=[]))
     monkeypatch.setattr(command, "play", lambda settings: None)
     monkeypatch.setattr(sys, "argv", ["play", *options])
     command.main()

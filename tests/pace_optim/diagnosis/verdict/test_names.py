@@ -378,9 +378,7 @@ def test_it_is_fitted_to_the_whole_robot_all_the_same(run, bench, monkeypatch, s
         monkeypatch.setattr(findings, name, lambda *_, made=made, **__: made)
     monkeypatch.setattr(module, "search_effects", lambda *_, **__: found)
     monkeypatch.setattr(module, "fit", fit)
-    line = SimpleNamespace(
-        say=said.append, wait_for=said.append, expect=lambda _: None, restart=lambda: None, close=lambda: None
-    )
+    line = SimpleNamespace(say=said.append, wait_for=said.append, restart=lambda: None, close=lambda: None)
     assert diagnose(DiagnosisSettings(run=run.folder), line).runs == [str(run.folder)] and not refits
     diagnosis = diagnose(DiagnosisSettings(run=run.folder, refit=True), line, seen.append)
     assert told == [1] and seen[0].runs == [str(run.folder)]  # the verdict is told before the robot is fitted

@@ -93,7 +93,7 @@ def test_a_command_prints_the_verdict_once_and_the_three_next_steps_last(tmp_pat
         **make_diagnosis() | {"runs": runs, "paying": ["stribeck_friction"], "evidence": ["It explains."]}
     )
 
-    def diagnosed(_, on_verdict):
+    def diagnosed(_, progress, on_verdict):
         on_verdict(found)
         return found
 
