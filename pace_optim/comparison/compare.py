@@ -157,12 +157,8 @@ def _summary(compared: Sequence[JointComparison]) -> str:
 
 
 def _carried(joints: Sequence[str], compared: Sequence[JointComparison]) -> str:
-    """Which few joints hold nearly all error above the noise; "" where many do, or all are explained."""
-    left = {
-        joint: 0.0 if _explained(own.content) else max(own.content["rmse"].values())
-        for joint, own in zip(joints, compared, strict=True)
-    }
-    return carried_by(left)
+    """Which few joints hold nearly all of the squared error; "" where many do."""
+    return carried_by({joint: max(own.content["rmse"].values()) for joint, own in zip(joints, compared, strict=True)})
 
 
 def _explained(content: dict[str, Any]) -> bool:

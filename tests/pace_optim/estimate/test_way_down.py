@@ -109,6 +109,14 @@ def test_an_iteration_must_gain_more_where_the_score_is_far_above_the_noise():
     assert LeastSquaresCfg(noise_score=1e-8).enough(1e-6) == 2e-3
 
 
+def test_a_way_that_had_left_pieces_goes_on_near_a_vector_on_the_whole(problem):
+    """Resumed with descents on pieces alone, it had none to go on with."""
+    resumed = way(problem)
+    resumed.descents = [Descent(x=centre(problem), stage=PIECES, stop_reason="converged", scores=[1.0])]
+    end = resumed.near(normalised(problem), LeastSquaresCfg(max_iteration=1))
+    assert end.stage == WHOLE and [each.stage for each in resumed.descents] == [PIECES, WHOLE]
+
+
 def test_a_way_that_is_resumed_is_the_one_that_was_interrupted(problem):
     seen = []
     staged = way(problem, on_iteration=lambda _: seen.append(checkpoint_of(staged.descents)))
