@@ -24,6 +24,8 @@ def add_effects(search: Search, problem: TwinProblem, base: Fitted) -> Outcome:
     found = search.tried(branch)
     while found is not None and any(effect is not None for effect in found.chosen):
         branch, found = added(search, branch, found)
+    unexplained = (branch.errors.mse - search.floor**2).clamp(min=0.0)
+    rounds = [*branch.rounds, *([] if found is None else [found])]
     return Outcome(
         problem=branch.problem,
         base=base,
@@ -31,7 +33,7 @@ def add_effects(search: Search, problem: TwinProblem, base: Fitted) -> Outcome:
         final=branch.now,
         final_errors=branch.errors,
         trees=search.trees,
-        rounds=[*branch.rounds, *([] if found is None else [found])],
+        rounds=[each.with_doubtful(unexplained) for each in rounds],
         cfg=cfg,
     )
 

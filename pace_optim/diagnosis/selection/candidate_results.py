@@ -10,6 +10,7 @@ import torch
 from pace_actuators.effects import Effect
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, JudgingCfg
 from pace_optim.diagnosis.selection.comparison import judge, within
+from pace_optim.estimate.error_bars.loop_rate import UNEXPLAINED
 from pace_optim.joints.fits.block_errors import BlockErrors
 from pace_optim.joints.fits.fitted import Fitted
 
@@ -72,6 +73,21 @@ class Round:
         chosen, every = list(self.chosen), list(self.rivals)
         chosen[joint], every[joint] = new, others if old is None or not tie else [*others, old]
         return replace(self, chosen=chosen, rivals=every)
+
+    def with_doubtful(self, unexplained: torch.Tensor) -> Round:
+        """The same with all effects as rivals that lose to the chosen one by less than what no model explains may do.
+
+        Args:
+            unexplained: Of each joint, squared error of the final model above the floor, (n,) [rad²].
+        """
+        every = list(self.rivals)
+        for j, (chosen, trials) in enumerate(zip(self.chosen, self.trials, strict=True)):
+            least = next((t.mse_after for t in trials if t.effect is chosen), None)
+            if least is not None:
+                most = least + UNEXPLAINED * float(unexplained[j])
+                near = [t.effect for t in trials if t.significant and t.effect is not chosen and t.mse_after <= most]
+                every[j] = [*every[j], *(effect for effect in near if effect not in every[j])]
+        return replace(self, rivals=every)
 
     def among_all(self, joints: torch.Tensor, now: Fitted) -> Round:
         """A round of some joints, (n,) bool, as one of all, whose model is known: nothing was tried on the others."""

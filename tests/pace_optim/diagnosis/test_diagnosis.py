@@ -242,6 +242,15 @@ def test_the_ranking_begins_with_what_was_added_and_names_its_rivals():
     json.dumps(entries)
 
 
+def test_what_stays_unexplained_may_decide_between_effects():
+    """Beside others as large, another delay (0.92 mrad) lost to a drive's bandwidth (0.78 mrad), and only that was named."""
+    trials = [make_trial(STRIBECK, 0, 7.8e-4), make_trial(QUADRATIC, 0, 9.2e-4), make_trial(GAIN, 0, 9.9e-4)]
+    this = Round(trials=[trials], chosen=[STRIBECK], rivals=[[]])
+    assert this.with_doubtful(torch.tensor([7.8e-4**2 - 1e-4**2])).rivals == [[QUADRATIC]]
+    assert this.with_doubtful(torch.tensor([0.0])).rivals == [[]]
+    assert replace(this, chosen=[None]).with_doubtful(torch.tensor([1.0])).rivals == [[]]
+
+
 def test_what_pays_no_longer_beside_what_was_added_is_not_said_to_pay():
     """A delay stood as "would pay" on a joint that another joint's effect had brought to the noise."""
     trials = [
