@@ -31,8 +31,6 @@ _GAINS = {"stiffness": "recording_stiffness", "damping": "recording_damping"}
 _GAIN_RANGE = 0.6
 _GAIN_SMALLEST = 0.05
 _GAIN_PAYS = 1.1
-_GAIN_REFITS = 2
-"""Recordings refitted with separate gains."""
 _REFINE = LeastSquaresCfg(max_iteration=12, score_tolerance=1e-4)
 """From the joint result: what is left after that is some tenths of a standard deviation."""
 
@@ -185,24 +183,19 @@ def _misreported_gains(problem: Problem, x: torch.Tensor, score: float) -> tuple
     Returns:
         Sentences, and the simulated steps that it took.
     """
-    best: tuple[float, int, dict[str, tuple[float, float]]] | None = None
-    promising, steps = list(range(problem.dataset.num_recordings)), 0
-    if len(promising) > _GAIN_REFITS:
-        promising, steps = _by_promise(problem, x)
-    for r in promising[:_GAIN_REFITS]:
-        wrong, start = _with_gains(problem, x, [r])
-        fit = _fit_from(wrong, start)
-        steps += fit.simulated_steps
-        space, physical = wrong.space, wrong.space.to_physical(fit.x)
-        found = {
-            gain: (float(physical[space[name]]), float(fit.uncertainty.std[space[name]][0]))
-            for gain, name in _GAINS.items()
-        }
-        if best is None or fit.score < best[0]:
-            best = (fit.score, r, found)
-    if best is None or score < _GAIN_PAYS**2 * best[0]:
+    r, left, steps = _most_promising(problem, x)
+    if score < _GAIN_PAYS**2 * left:
         return [], steps
-    _, r, found = best
+    wrong, start = _with_gains(problem, x, [r])
+    fit = _fit_from(wrong, start)
+    steps += fit.simulated_steps
+    if score < _GAIN_PAYS**2 * fit.score:
+        return [], steps
+    space, physical = wrong.space, wrong.space.to_physical(fit.x)
+    found = {
+        gain: (float(physical[space[name]]), float(fit.uncertainty.std[space[name]][0]))
+        for gain, name in _GAINS.items()
+    }
     name = problem.dataset.recordings[r].name
     sentences = []
     for field_name, (value, error) in found.items():
@@ -228,14 +221,14 @@ def _nominal_gain(problem: Problem, r: int, field_name: str) -> torch.Tensor:
     return result
 
 
-def _by_promise(problem: Problem, x: torch.Tensor) -> tuple[list[int], int]:
-    """Recordings in the order of what other gains would explain of them, by the derivatives at x.
+def _most_promising(problem: Problem, x: torch.Tensor) -> tuple[int, float, int]:
+    """The recording of which other gains would explain most, by the derivatives at x.
 
     With J the derivatives of the residuals r by all parameters and by one recording's gains, a Gauss–Newton step would
     lower the score by rᵀJ (JᵀJ)⁻¹ Jᵀr. The gains of all recordings are perturbed at once, as each moves its own only.
 
     Returns:
-        Indices of the recordings, and the simulated steps that it took.
+        Its index, the score that the step would leave [rad²], and the simulated steps that it took.
     """
     problem, x = _with_gains(problem, x, range(problem.dataset.num_recordings))
     evaluator = problem.training_evaluator()
@@ -249,8 +242,9 @@ def _by_promise(problem: Problem, x: torch.Tensor) -> tuple[list[int], int]:
         columns[rows] = 0.0
         columns[rows, :, r] = there.columns[rows, :, r]
         hessian, gradient = replace(there, columns=columns).normal_equations()
-        falls.append(gradient @ torch.linalg.pinv(hessian, hermitian=True) @ gradient)
-    return torch.stack(falls).argsort(descending=True).tolist(), evaluator.simulated_steps
+        falls.append(float(gradient @ torch.linalg.pinv(hessian, hermitian=True) @ gradient))
+    best = int(np.argmax(falls))
+    return best, float(there.residuals.score[0]) - falls[best], evaluator.simulated_steps
 
 
 def _with_gains(problem: Problem, x: torch.Tensor, which: Sequence[int]) -> tuple[Problem, torch.Tensor]:

@@ -56,8 +56,7 @@ def test_a_damping_that_is_misreported_by_30_percent_is_named_with_its_recording
 
 
 @pytest.mark.parametrize("place", range(3))
-def test_the_recording_to_refit_is_known_beforehand(recordings, place, monkeypatch):
-    monkeypatch.setattr(consistency, "_GAIN_REFITS", 1)
+def test_the_recording_to_refit_is_known_beforehand(recordings, place):
     kp, kd = list(GAINS.values())[place]
     drive = Drive(stiffness=np.array([kp * 1.25]), damping=np.array([kd]))
     wrong = [*recordings]
