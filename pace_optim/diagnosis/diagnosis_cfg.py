@@ -110,8 +110,6 @@ class LinksCfg:
     """The best of them that are refined, ..."""
     load_place: float = 1e-4
     """... until their neighbours are this near [m]."""
-    step: float = 1e-2
-    """Normalised step of the derivatives."""
     tried: int = 6
     """Candidates of a round that are fitted, ..."""
     of_link: int = 3

@@ -30,11 +30,10 @@ from pace_actuators.text import conjoined, plural
 from pace_envs.link_inertia import NAMES, OF_BODY, PARTS, TEN, UNITS, Reference
 from pace_envs.tasks.pace import sought_links
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg, LinksCfg
-from pace_optim.estimate.derivatives import stencil
 from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
 from pace_optim.estimate.error_bars.uncertainty import SURE, inverse_of
-from pace_optim.estimate.least_squares import LeastSquaresCfg, least_squares
+from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, least_squares
 from pace_optim.problem.problem import Problem
 
 LOOK_ALIKES = ("torque_gain", "proportional_gain", "gravity_compensation", "parallel_spring", "torque_offset")
@@ -312,11 +311,9 @@ def listed_candidates(promising: Sequence[tuple[float, Reference]], cfg: LinksCf
 
 def _look(problem: Problem, x: torch.Tensor, cfg: LinksCfg) -> tuple[torch.Tensor, torch.Tensor, float]:
     """H, g and the score [rad²] at a normalised vector, on pieces."""
-    pieces = problem.on_pieces(cfg.share)
-    around = stencil(x, problem.colouring, first=cfg.step)
-    vectors = torch.cat([x[None], around.vectors])
-    residuals = pieces.training_evaluator().residuals(problem.space.to_physical(vectors))
-    return *around.jacobian(residuals).normal_equations(), float(residuals.rows(0, 1).score)
+    descent = Descent(x=x)
+    hessian, gradient, _ = descent.look(problem.on_pieces(cfg.share).training_evaluator())
+    return hessian, gradient, descent.score
 
 
 def _score_of(gradient: torch.Tensor, hessian: torch.Tensor, entries: Sequence[int]) -> float:
