@@ -102,7 +102,7 @@ def without_fact_files(
     paths: Sequence[str | os.PathLike[str]], facts: str | os.PathLike[str] | None = None
 ) -> list[str]:
     """Leave out JSON files of facts, as ``folder/*`` lists them: those beside a recording, and `facts` of all."""
-    recordings = {Path(path).with_suffix("") for path in paths if Path(path).suffix.lower() in SUFFIXES}
+    recordings = {Path(path).with_suffix("") for path in paths if Path(path).suffix.lower() != ".json"}
     of_all = [] if facts is None else [Path(facts).resolve()]
     return [
         str(path)

@@ -310,11 +310,7 @@ def input_digests(settings: FitSettings, record: EnvironmentRecord) -> dict[str,
     ``None`` stands for facts that are not there: they would be read if they came.
     """
     code = {entry["file"]: entry["sha256"] for entry in record.code.values()}
-    beside = [
-        Path(name).with_suffix(".json")
-        for name in (*settings.data, *settings.validation)
-        if not name.endswith((".npz", ".pt"))
-    ]
+    beside = [Path(name).with_suffix(".json") for name in (*settings.data, *settings.validation)]
     given = {name: file_digest(name) for name in (settings.columns, settings.facts) if name is not None}
     return {**record.files, **code, **given, **{str(path): _digest_if_there(path) for path in beside}}
 

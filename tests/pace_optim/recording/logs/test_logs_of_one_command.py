@@ -156,3 +156,12 @@ def test_a_run_keeps_the_file_of_gains_and_a_folder_may_list_it(tmp_path, monkey
     kept = with_absolute_paths(settings, None)
     assert kept.facts == str(facts)
     assert str(facts) in input_digests(kept, SimpleNamespace(code={}, files={}))
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".pt", ".mcap", ".csv"])
+def test_facts_beside_a_recording_of_any_format_are_no_recording_and_have_a_digest(tmp_path, suffix):
+    recording, facts = tmp_path / f"leg{suffix}", tmp_path / "leg.json"
+    facts.write_text("{}")
+    settings = FitSettings(task="x", data=[str(facts), str(recording)])
+    assert settings.data == [str(recording)]
+    assert input_digests(settings, SimpleNamespace(code={}, files={}))[str(facts)] is not None
