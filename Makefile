@@ -1,7 +1,7 @@
 # `make test` and `make demo` need Python >= 3.11 with venv, nothing else; the second run reuses .venv.
 #
 #   make test PYTHON=python3.12          another interpreter
-#   make test PYTEST_ARGS="-m 'not slow'"
+#   make test PYTEST_ARGS=tests/pace_envs     the quick tests of a folder; make test-all: the slow ones too
 #
 # torch without GPU libraries: on Linux the default registry's torch may bring several GB of CUDA packages.
 # Everything runs on the CPU, so a CPU wheel is enough. Point pip at one, by any of
@@ -24,10 +24,10 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo docs test pytest lint format clean
+.PHONY: help install demo docs test test-all pytest pytest-all lint format clean
 
 help:  ## this list
-	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## */  make \1\t/' | expand -t 18
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */  make \1\t/' | expand -t 18
 
 install: $(STAMP)  ## create .venv and install everything, pinned and editable
 
@@ -49,10 +49,16 @@ lint: install  ## ruff and mypy
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy $(PACKAGES)
 
-test: install  ## lint, types and tests, side by side
+test: install  ## lint, types and the quick tests, side by side
 	@$(MAKE) --no-print-directory --jobs=2 lint pytest
 
+test-all: install  ## the same with all tests: what CI runs
+	@$(MAKE) --no-print-directory --jobs=2 lint pytest-all
+
 pytest: install
+	$(BIN)/python -m pytest -m "not slow" $(PYTEST_ARGS)
+
+pytest-all: install
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 format: install  ## put imports and layout right
