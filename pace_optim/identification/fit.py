@@ -140,9 +140,7 @@ def _by_torques(
     return first, folder
 
 
-def _attempts(
-    first: FitResult, folder: Path, settings: FitSettings, beside: bool
-) -> Iterator[tuple[str, FitSettings]]:
+def _attempts(first: FitResult, folder: Path, settings: FitSettings, beside: bool) -> Iterator[tuple[str, FitSettings]]:
     """What is fitted by torques, in words and as settings."""
     unknown = [*settings.unknown, *(fact for fact in first.contested if fact not in settings.unknown)]
     other = replace(settings, unknown=unknown, instead_of=str(folder.absolute()))

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from pace_actuators.effects import Effect, EffectParameter
+from pace_actuators.joint_units import JointType, units_for
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.estimate.error_bars.physics_step import FINER, TO_NO_STEP
 from pace_optim.estimate.error_bars.uncertainty import ANYWHERE, sandwich
@@ -48,20 +49,32 @@ def sizes(fits: Fits, outcome: Outcome, floor: torch.Tensor, joint_names: tuple[
             std[has, columns] = std[has, columns].pow(-2).sum(dim=0).pow(-0.5)
         for j in has.nonzero()[:, 0].tolist():
             values = (each[j, columns].tolist() for each in (now.physical, std, stuck))
+            kind = now.model.joint_type(j)
             result += [
-                {
-                    "effect": effect.name,
-                    "parameter": parameter.name,
-                    "joint": joint_names[j],
-                    "value": value,
-                    "std": error if error > 0 and not unsure[j] else None,
-                    "unit": parameter.unit,
-                    "factor": factor_of(effect, parameter, value),
-                    "at_bound": held_back,
-                }
+                {"effect": effect.name, "parameter": parameter.name, "joint": joint_names[j]}
+                | size_of(effect, parameter, value, None if unsure[j] else error, kind, held_back)
                 for parameter, value, error, held_back in zip(effect.parameters, *values, strict=True)
             ]
     return result
+
+
+def size_of(
+    effect: type[Effect],
+    parameter: EffectParameter,
+    value: float,
+    std: float | None,
+    joint_type: JointType,
+    at_bound: bool = False,
+) -> dict[str, Any]:
+    """The size of an effect's parameter on a joint, with an error bar if that is not zero."""
+    return {
+        "parameter": parameter.name,
+        "value": value,
+        "std": std or None,
+        "unit": units_for(parameter.unit, [joint_type]),
+        "factor": factor_of(effect, parameter, value),
+        "at_bound": at_bound,
+    }
 
 
 def without_error_bars(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
