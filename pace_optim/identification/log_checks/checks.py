@@ -35,13 +35,13 @@ _WORTH = 0.6
 """Of the misfits in a coarse look: a change that leaves more is not looked at further."""
 _TWICE = 1.8
 """Smallest factor between units, or of a gear, that is named."""
-_LEAST_TRAVEL, _MOST_TRAVEL = 0.15, 7.0
-"""Of a joint in a recording that is fitted [rad]."""
-_SCALES = np.geomspace(1 / 200, 200, 27)
+_TRAVEL: Mapping[JointType, tuple[float, float]] = {"hinge": (0.15, 7.0), "slide": (0.01, 7.0)}
+"""Least and most of a joint in a recording that is fitted [rad, m]."""
+_SCALES = np.geomspace(1 / 1500, 1500, 37)
 _DIRECTIONS = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], float)
 _SHARE = 0.02
 """Part of a recording in which a limit must act to be named."""
-_COMMANDED = 0.05
+_COMMANDED: Mapping[JointType, float] = {"hinge": 0.05, "slide": 0.005}
 """Travel of a command that moves a joint whose drive is on [rad, m]."""
 _FOLLOWED = 0.02
 """Part of that travel which is no motion."""
@@ -54,7 +54,9 @@ _ABRUPT = 3.0
 _NUMERICAL = 1e-9
 """Steps that are rounding [rad]."""
 _SPIKE = 3.0
-"""Of the steps that are larger than most: the two steps of a spike."""
+"""Of the steps that are larger than most: the two steps of a spike, ..."""
+_LEAST_SPIKE: Mapping[JointType, float] = {"hinge": 1e-3, "slide": 1e-4}
+"""... and the smallest one [rad, m]."""
 _TILT = 15.0
 """Smallest turn of gravity that is named [degrees]."""
 
@@ -257,7 +259,12 @@ def scaled(evidence: Evidence) -> Iterator[Change]:
             float(np.ptp(series[:, joints], axis=0).max()) for series in (view.position, view.target)
         )
         for scales, positions, targets, what in (
-            (_both_scales(min(measured, commanded)), True, True, "positions and targets"),
+            (
+                _both_scales(min(measured, commanded), {view.types[j] for j in joints}),
+                True,
+                True,
+                "positions and targets",
+            ),
             (_scales_about(measured, commanded), True, False, "the positions (dof_pos)"),
             (_scales_about(commanded, measured), False, True, "the targets (des_dof_pos)"),
         ):
@@ -274,15 +281,15 @@ def scaled(evidence: Evidence) -> Iterator[Change]:
                 yield Change(
                     joints=tuple(joints),
                     view=changed(factor),
-                    text=f"{what} of {{joints}} are {factor:.3g} times those of the joint. {_cure_of(factor)}",
+                    text=f"{what} of {{joints}} are {factor:.4g} times those of the joint. {_cure_of(factor)}",
                 )
 
 
-def _both_scales(travel: float) -> np.ndarray:
-    """Factors that leave a joint's travel one that is usual."""
-    return _SCALES[
-        (travel / _SCALES > _LEAST_TRAVEL) & (travel / _SCALES < _MOST_TRAVEL) & (abs(np.log(_SCALES)) > 0.5)
-    ]
+def _both_scales(travel: float, types: set[JointType]) -> np.ndarray:
+    """Factors that leave the travel of joints of some types one that is usual."""
+    least, most = zip(*(_TRAVEL[each] for each in types), strict=True)
+    own = travel / _SCALES
+    return _SCALES[(own > min(least)) & (own < max(most)) & (abs(np.log(_SCALES)) > 0.5)]
 
 
 def _scales_about(one: float, other: float) -> np.ndarray:
@@ -298,14 +305,17 @@ _UNITS = (
 )  # fmt: skip
 _NEAR = 0.05
 """Relative distance within which a factor is that of a unit, or a gear's whole ratio."""
+_LARGEST_GEAR = 400.0
+"""A factor beyond that of any gear is that of a unit."""
 
 
 def _known(factor: float) -> float:
     """The factor of a unit or a gear that is nearest, if one is near."""
     whole = round(factor) if factor > 1 else 1 / round(1 / factor)
-    known = [value for value, _ in _UNITS] + [float(whole)]
+    is_unit = abs(np.log(factor)) > np.log(_LARGEST_GEAR)
+    known = [value for value, _ in _UNITS] + [float(whole)] * (not is_unit)
     nearest = min(known, key=lambda value: abs(np.log(factor / value)))
-    return nearest if abs(factor / nearest - 1) < _NEAR else factor
+    return nearest if is_unit or abs(factor / nearest - 1) < _NEAR else factor
 
 
 def _cure_of(factor: float) -> str:
@@ -403,7 +413,7 @@ def _limits_of(view: View, j: int) -> str:
     told = [f"{limit:.3g}"] if np.isfinite(limit) else []
     if np.isfinite(stall) and np.isfinite(fastest):
         told.append(f"{stall:.3g} at stall, 0 at {fastest:.3g} rad/s")
-    return "; ".join(told) or "no limit"
+    return units_for("; ".join(told), [view.types[j]]) or "no limit"
 
 
 def _of_known_gains(evidence: Evidence) -> list[int]:
@@ -430,8 +440,8 @@ def torque_limit(evidence: Evidence) -> Iterator[Change]:
             yield Change(
                 joints=(j,),
                 view=changed(limit),
-                text="the torque of {joints} ends below the stated limit. State the real effort_limit in the facts "
-                "(--facts FILE, or NAME.json beside the log), or let it be sought: --unknown effort_limit.",
+                text="the torque of {joints} ends below any limit that is stated. State the real effort_limit in the "
+                "facts (--facts FILE, or NAME.json beside the log), or let it be sought: --unknown effort_limit.",
                 limit=(_limits_of(view, j), limit),
             )
 
@@ -530,7 +540,9 @@ def standstill(view: View) -> Iterator[Change]:
         np.ptp(view.target, axis=0), np.ptp(np.cumsum(view.target_vel, axis=0), axis=0) * view.control_dt
     )
     moved = np.ptp(view.smooth(view.position), axis=0)
-    still = [j for j in range(len(view.joints)) if travel[j] > _COMMANDED and moved[j] < _FOLLOWED * travel[j]]
+    still = [
+        j for j, kind in enumerate(view.types) if travel[j] > _COMMANDED[kind] and moved[j] < _FOLLOWED * travel[j]
+    ]
     dead = [j for j in still if np.ptp(view.position[:, j]) == 0.0]
     for joints, what, cure in (
         (dead, "never changes", "the encoder is dead or not logged, or the joint is blocked"),
@@ -561,7 +573,7 @@ def frozen_encoder(view: View) -> Iterator[Change]:
             (a, b)
             for a, b in runs
             if max(jerk[a], jerk[b]) > _ABRUPT * usual
-            and np.ptp(view.target[view.steps[a] : view.steps[b], j]) > _COMMANDED
+            and np.ptp(view.target[view.steps[a] : view.steps[b], j]) > _COMMANDED[view.types[j]]
         ]
         if not frozen:
             continue
@@ -582,7 +594,7 @@ def spikes(view: View) -> Iterator[Change]:
     """Single positions lie far from their neighbours."""
     for j in range(len(view.joints)):
         position = view.position[:, j]
-        found = _spikes_of(position)
+        found = _spikes_of(position, _LEAST_SPIKE[view.types[j]])
         if found.any():
             first = float(np.flatnonzero(found)[0] * view.dt)
             at = np.arange(len(position))
@@ -594,10 +606,10 @@ def spikes(view: View) -> Iterator[Change]:
             )
 
 
-def _spikes_of(position: np.ndarray) -> np.ndarray:
+def _spikes_of(position: np.ndarray, least: float) -> np.ndarray:
     """Up to three samples away from both neighbours, by steps that are large for the recording, (K,) bool."""
     step = np.diff(position)
-    least = max(_SPIKE * float(np.quantile(np.abs(step), 0.98)), 0.01 * float(np.ptp(position)), 1e-3)
+    least = max(_SPIKE * float(np.quantile(np.abs(step), 0.98)), 0.01 * float(np.ptp(position)), least)
     found = np.zeros(len(position), dtype=bool)
     for a in np.flatnonzero(np.abs(step) > least):
         for length in (1, 2, 3):
@@ -648,7 +660,9 @@ def explained(view: View) -> list[Finding]:
     for check in SIGHTS:
         for change in list(check.changes(view)):
             findings.append(_finding(check, change))
-            view = replace(view, position=change.view.position, used=view.used & change.view.used)
+            joints = list(change.joints)
+            position = _column(view.position, joints, change.view.position[:, joints])
+            view = replace(view, position=position, used=view.used & change.view.used)
     before = evidence = Evidence.of(view)
     for change in list(lifted_limits(evidence)):
         (j,) = change.joints
