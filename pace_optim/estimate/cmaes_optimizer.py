@@ -110,7 +110,8 @@ class TreeSearch:
             )
         self._consensus: np.ndarray | None = None if len(groups) > 1 and self._shared else np.zeros(0)
         self._line: np.ndarray | None = None
-        self.line_generation = self._planned_line = -1
+        self.line_generation = -1
+        self._restored_line: int | None = None
         self._stopped: list[str] = []
 
     def ask(self) -> torch.Tensor:
@@ -195,7 +196,12 @@ class TreeSearch:
             history: The other one's ``history``: scores of each generation, (population_size, trees).
             line_generation: The other one's ``line_generation``.
         """
-        self._planned_line, self._doers = line_generation, Processes()  # each for itself: the others may not do it
+        if len(history) > self.cfg.max_iteration:
+            raise ValueError(
+                f"The search has had {len(history)} generations, more than max_iteration {self.cfg.max_iteration}. "
+                "Give it as many or more."
+            )
+        self._restored_line, self._doers = line_generation, Processes()  # each for itself: the others may not do it
         for scores in history:
             if scores.shape != (self.population_size, len(self.strategies)):
                 raise ValueError(
@@ -207,7 +213,7 @@ class TreeSearch:
             self._learn(np.asarray(scores))
             if after_generation is not None:
                 after_generation(self)
-        self._doers = self.processes
+        self._restored_line, self._doers = None, self.processes
 
     def _learn(self, scores: np.ndarray) -> None:
         self.generation_scores = scores
@@ -235,9 +241,9 @@ class TreeSearch:
 
     def _ready_for_consensus(self) -> bool:
         """Whether all trees know their shared parameters well, or time is running out."""
-        if self._planned_line >= 0:  # as in the run that is restored, whatever its max_iteration was
-            return self.generation == self._planned_line
-        if self.generation >= _CONSENSUS_LATEST * self.cfg.max_iteration:
+        if self._restored_line is not None:  # whatever max_iteration was
+            return self.generation == self._restored_line
+        if self.generation >= min(_CONSENSUS_LATEST * self.cfg.max_iteration, self.cfg.max_iteration - 1):
             return self.generation > 0
         known = [
             bool(s.stop_reason) or float(s.spread[self._positions(s)].max()) < _CONSENSUS_SPREAD

@@ -12,7 +12,7 @@ from pace_actuators.effects import effect_modules
 from pace_actuators.text import listed
 from pace_envs.task_source import EnvironmentRecord
 from pace_optim.estimate.own_objective import optimizer_modules, use_recorded_optimizer
-from pace_optim.estimate.search import agree_to_stop, search
+from pace_optim.estimate.search import search
 from pace_optim.identification.conclude import conclude, conclude_own
 from pace_optim.identification.optimization import Optimization, with_structures
 from pace_optim.identification.setup import load_for_fit, make_optimizer, make_searcher
@@ -223,10 +223,10 @@ def help_fit(processes: Processes, device: str, path: str | None = None, task: s
         path: The run's folder, if it is resumed.
         task: As for :func:`resume`.
     """
-    start: Any = processes.agree(None)
+    start: Any = processes.agree(None, at_leisure=True)
     if start is None:
         return
-    settings, around, history, line_generation, loop = start
+    settings, around, history, line_generation, max_iteration, loop = start
     settings = replace(settings, device=device)
     env_cfg = None if path is None else _reopened(Path(path), settings, task).load_cfg()
     problem = load_for_fit(settings, env_cfg, tell_nobody)
@@ -235,8 +235,9 @@ def help_fit(processes: Processes, device: str, path: str | None = None, task: s
         problem = with_structures(problem, None, around)
     searcher = make_searcher(problem, settings)
     optimizer = make_optimizer(problem, settings, processes, around if len(around) else None)
+    optimizer.cfg = replace(optimizer.cfg, max_iteration=max_iteration)
     optimizer.restore(history, line_generation)
-    search(optimizer, searcher.rollout(optimizer.num_shown), lambda _: agree_to_stop(optimizer, processes))
+    search(optimizer, searcher.rollout(optimizer.num_shown))
 
 
 def _reopened(path: Path, settings: FitSettings, task: str | None) -> Run:
