@@ -208,7 +208,7 @@ def test_the_sizes_of_single_recordings_are_those_that_each_shows(run):
     assert torch.allclose(apart[:, 1], now.physical[0, columns.start + 1], atol=0.02)
 
 
-def test_halves_stand_for_recordings_where_there_are_one_or_two(run):
+def test_halves_of_two_recordings_and_quarters_of_one_stand_for_recordings(run):
     assert float(unevenness(fitted_to(run.problem, 1.0, 2.0))[0]) > 0.5
     one = fitted_to(run.problem, 1.0)
     assert float(unevenness(one).max()) < 0.1
