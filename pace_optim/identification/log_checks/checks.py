@@ -11,6 +11,7 @@ import itertools
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -119,7 +120,7 @@ class Finding:
         names, pattern = in_short(list(self.limits))
         unit = units_for("N m", [types[joint] for joint in self.limits])
         stated, shown = zip(*self.limits.values(), strict=True)
-        seen = "needed" if self.check == _LIFTED.name else "seen"
+        seen = "needed" if self.check == "lifted limits" else "seen"
         rows = aligned(
             [
                 [f"joint {pattern}".strip(), *names],
@@ -167,16 +168,6 @@ class Evidence:
             (j for j, each in self.balance.items() if each.misfit > _DOUBTED),
             key=lambda j: -self.balance[j].misfit,
         )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Check:
-    """One kind of fault."""
-
-    name: str
-    changes: Callable[[Any], Iterator[Change]]
-    """The changes that are worth trying."""
-    stops: bool
 
 
 def _column(series: np.ndarray, joint: int | list[int], values: np.ndarray) -> np.ndarray:
@@ -271,11 +262,7 @@ def scaled(evidence: Evidence) -> Iterator[Change]:
             if not len(scales):
                 continue
 
-            def changed(
-                factor: float, joints: list[int] = joints, positions: bool = positions, targets: bool = targets
-            ) -> View:
-                return _scaled(view, joints, 1 / factor if positions else None, 1 / factor if targets else None)
-
+            changed = partial(_divided, view, joints, positions, targets)
             factor = _known(_least(evidence, changed, scales, joints))
             if abs(np.log(factor)) > np.log(_TWICE):
                 yield Change(
@@ -283,6 +270,10 @@ def scaled(evidence: Evidence) -> Iterator[Change]:
                     view=changed(factor),
                     text=f"{what} of {{joints}} are {factor:.4g} times those of the joint. {_cure_of(factor)}",
                 )
+
+
+def _divided(view: View, joints: list[int], positions: bool, targets: bool, factor: float) -> View:
+    return _scaled(view, joints, 1 / factor if positions else None, 1 / factor if targets else None)
 
 
 def _both_scales(travel: float, types: set[JointType]) -> np.ndarray:
@@ -407,6 +398,12 @@ def _without_limits(view: View, j: int) -> View:
     return replace(view, **limits)
 
 
+def _limited(view: View, j: int, limit: float) -> View:
+    limits = view.effort_limit.copy()
+    limits[j] = limit
+    return replace(view, effort_limit=limits)
+
+
 def _limits_of(view: View, j: int) -> str:
     """The limits of a joint's drive, for a table."""
     limit, stall, fastest = view.effort_limit[j], view.saturation_effort[j], view.velocity_limit[j]
@@ -430,11 +427,7 @@ def torque_limit(evidence: Evidence) -> Iterator[Change]:
         if len(most) < 2:
             continue
 
-        def changed(limit: float, j: int = j) -> View:
-            limits = view.effort_limit.copy()
-            limits[j] = limit
-            return replace(view, effort_limit=limits)
-
+        changed = partial(_limited, view, j)
         limit = _least(evidence, changed, most, [j])
         if limit < view.effort_limit[j] and np.mean(np.abs(view.asked(j)) > limit) > _SHARE:
             yield Change(
@@ -508,14 +501,10 @@ def _of_base(view: View, evidence: Evidence) -> list[Finding]:
             text=f"the IMU is {1e3 * abs(found[1]):.2g} ms {'later' if found[1] > 0 else 'earlier'} than the encoders. "
             "It is shifted by that for the fit. Correct its time stamps.",
         )
-        result.append(replace(_finding(_LATE_IMU, change), imu_delays={view.name: found[1]}))
+        result.append(replace(_finding("IMU delay", change), imu_delays={view.name: found[1]}))
     for joints, text in stuck_contacts(view, lambda: evidence.doubted):
-        result.append(_finding(_CONTACTS, Change(joints=tuple(joints), view=view, text=text)))
+        result.append(_finding("contacts", Change(joints=tuple(joints), view=view, text=text)))
     return result
-
-
-_LATE_IMU = Check(name="IMU delay", changes=lambda _: iter(()), stops=False)
-_CONTACTS = Check(name="contacts", changes=lambda _: iter(()), stops=False)
 
 
 def _least(evidence: Evidence, changed: Callable[[float], View], values: np.ndarray, joints: list[int]) -> float:
@@ -633,32 +622,33 @@ def _runs(where: np.ndarray) -> list[tuple[int, int]]:
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
-SIGHTS = (
-    Check(name="standstill", changes=standstill, stops=True),
-    Check(name="frozen encoder", changes=frozen_encoder, stops=True),
-    Check(name="spikes", changes=spikes, stops=False),
-)
+_SIGHTS: Mapping[str, Callable[[View], Iterator[Change]]] = {
+    "standstill": standstill,
+    "frozen encoder": frozen_encoder,
+    "spikes": spikes,
+}
 """What is seen in a log by itself."""
-_LIFTED = Check(name="lifted limits", changes=lifted_limits, stops=False)
-"""Named by itself: a motion that follows what is asked refutes a limit, also where something else is missing."""
-CHECKS = (
-    Check(name="IMU units", changes=imu_units, stops=True),
-    Check(name="IMU axes", changes=imu_axes, stops=True),
-    Check(name="reversed sign", changes=reversed_sign, stops=True),
-    Check(name="swapped joints", changes=swapped, stops=True),
-    Check(name="wrapped targets", changes=wrapped_targets, stops=True),
-    Check(name="clipped targets", changes=clipped_targets, stops=True),
-    Check(name="gravity", changes=turned_gravity, stops=False),
-    Check(name="torque limit", changes=torque_limit, stops=False),
-    Check(name="scale", changes=scaled, stops=True),
-)
+_CHECKS: Mapping[str, Callable[[Evidence], Iterator[Change]]] = {
+    "IMU units": imu_units,
+    "IMU axes": imu_axes,
+    "reversed sign": reversed_sign,
+    "swapped joints": swapped,
+    "wrapped targets": wrapped_targets,
+    "clipped targets": clipped_targets,
+    "gravity": turned_gravity,
+    "torque limit": torque_limit,
+    "scale": scaled,
+}
+"""Changes of a log, or of what is taken for granted, that are worth trying."""
+_GOES_ON = ("spikes", "gravity", "torque limit", "lifted limits", "IMU delay", "contacts")
+"""Checks after which a fit can be right."""
 
 
 def explained(view: View) -> list[Finding]:
     """What is wrong with a recording, change by change."""
     findings = []
-    for check in SIGHTS:
-        for change in list(check.changes(view)):
+    for check, changes in _SIGHTS.items():
+        for change in list(changes(view)):
             findings.append(_finding(check, change))
             joints = list(change.joints)
             position = _column(view.position, joints, change.view.position[:, joints])
@@ -668,9 +658,9 @@ def explained(view: View) -> list[Finding]:
         (j,) = change.joints
         after = Evidence.of(_without_limits(evidence.view, j), evidence, change.joints)
         if _gain(evidence, after, change) > 0:
-            findings.append(_finding(_LIFTED, change, evidence.balance[j].misfit, after.balance[j].misfit))
+            findings.append(_finding("lifted limits", change, evidence.balance[j].misfit, after.balance[j].misfit))
             evidence = after
-    named: list[tuple[Check, Change]] = []
+    named: list[tuple[str, Change]] = []
     for _ in range(2 * len(view.joints) + 1):
         step = _best_change(evidence)
         if step is None:
@@ -685,20 +675,20 @@ def explained(view: View) -> list[Finding]:
     return findings if view.frame is None else findings + _of_base(view, evidence)
 
 
-def _finding(check: Check, change: Change, before: float | None = None, after: float = 0.0) -> Finding:
+def _finding(check: str, change: Change, before: float | None = None, after: float = 0.0) -> Finding:
     names = tuple(change.view.joints[j] for j in sorted(change.joints))
     return Finding(
-        check=check.name, recordings=(change.view.name,), joints=names, before=before, after=after,
-        text=change.text, stops=check.stops, limits={names[0]: change.limit} if change.limit else {},
+        check=check, recordings=(change.view.name,), joints=names, before=before, after=after,
+        text=change.text, stops=check not in _GOES_ON, limits={names[0]: change.limit} if change.limit else {},
     )  # fmt: skip
 
 
-def _best_change(evidence: Evidence) -> tuple[Check, Change, Evidence] | None:
+def _best_change(evidence: Evidence) -> tuple[str, Change, Evidence] | None:
     """The change that explains most; the first after which nothing is doubted."""
-    best: tuple[float, Check, Change, Evidence] | None = None
+    best: tuple[float, str, Change, Evidence] | None = None
     coarse = evidence.coarse()
-    for check in CHECKS:
-        for change in check.changes(evidence):
+    for check, changes in _CHECKS.items():
+        for change in changes(evidence):
             if not _may_explain(coarse, change):
                 continue
             after = Evidence.of(change.view, evidence, change.joints)
@@ -738,7 +728,7 @@ def check_log(problem: Problem) -> list[Finding]:
             f"no joint moves by {1e3 * _STANDS:g} mrad or mm: a robot that stands shows no parameter. Record a motion."
         )
         still = Change(joints=tuple(range(len(views[0].joints))), view=views[0], text=text)
-        return [replace(_finding(SIGHTS[0], still), recordings=tuple(view.name for view in views))]
+        return [replace(_finding("standstill", still), recordings=tuple(view.name for view in views))]
     for view in views:
         for finding in explained(view):
             merged.setdefault((finding.check, finding.joints), []).append(finding)

@@ -284,7 +284,7 @@ def told_in_words(found, problem):
 def told_of(outcome, decision, shares, hints=()):
     return Findings(
         outcome=outcome,
-        data=DataCheck(floor=FLOOR, noise=FLOOR, numerical=FLOOR),
+        data=DataCheck(floor=FLOOR, noise=FLOOR),
         absorbed={},
         verdict=decision,
         explained=0.75,

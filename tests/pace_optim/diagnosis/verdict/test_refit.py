@@ -37,7 +37,7 @@ def found_on_joints(*effects):
     shares = {effect: 1.0 / len(effects) for effect, _ in effects}
     return Findings(
         outcome=outcome,
-        data=DataCheck(floor=FLOOR, noise=FLOOR, numerical=FLOOR),
+        data=DataCheck(floor=FLOOR, noise=FLOOR),
         absorbed={},
         verdict="effect",
         explained=1.0,
