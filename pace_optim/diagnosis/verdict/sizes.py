@@ -10,7 +10,7 @@ import torch
 from pace_actuators.effects import Effect, EffectParameter
 from pace_actuators.joint_units import JointType, units_for
 from pace_optim.diagnosis.search.state import Outcome
-from pace_optim.estimate.error_bars.physics_step import FINER, TO_NO_STEP
+from pace_optim.estimate.error_bars.physics_step import FINER, TO_NO_STEP, has_no_step
 from pace_optim.estimate.error_bars.uncertainty import ANYWHERE, sandwich
 from pace_optim.joints.fits.fits import Fits
 from pace_optim.joints.fits.fitted import Fitted
@@ -116,7 +116,7 @@ def standard_deviations(now: Fitted) -> torch.Tensor:
 def _step_shares(fits: Fits, problem: TwinProblem, now: Fitted) -> torch.Tensor:
     """The part of each value that makes up for the physics step, physical (n, P), as in a fit's ``step_share``.
 
-    The errors change by c without a step, and a fit would then move by - (JᵀJ)⁻¹ Jᵀ c.
+    The errors change by c without a step, and a fit would then move by - (JᵀJ)⁻¹ Jᵀ c, if the recording has no step.
     """
     columns, error, result = now.free_jacobian, now.error, torch.zeros_like(now.x)
     if error is None:
@@ -127,7 +127,9 @@ def _step_shares(fits: Fits, problem: TwinProblem, now: Fitted) -> torch.Tensor:
         own = columns[..., j].double().flatten(1)
         free = own.norm(dim=1).nonzero()[:, 0]
         move = torch.linalg.lstsq(own[free].T, change[..., j].flatten()[:, None], driver="gelsd").solution[:, 0]
-        result[j, free] = move
+        left = change[..., j] - (move @ own[free]).view_as(change[..., j])
+        if has_no_step(error[..., j, None].double(), left[..., None], torch.ones_like(left, dtype=torch.bool)):
+            result[j, free] = move
     return result * now.model.box.slope(now.x)
 
 

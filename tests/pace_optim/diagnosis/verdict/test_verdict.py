@@ -185,7 +185,7 @@ def test_a_value_that_joints_share_has_the_error_bar_of_them_all_and_of_the_step
     shared = replace(alone, model=replace(model, shared=frozenset({GAIN})), jacobian=None)
 
     class Fits:
-        change = 0.0
+        change, beside = 0.0, 0.0
 
         def looked_at(self, problem, models):
             return [replace(each, jacobian=one, error=error) for each in models]
@@ -194,7 +194,7 @@ def test_a_value_that_joints_share_has_the_error_bar_of_them_all_and_of_the_step
             return replace(now, jacobian=one, error=error)
 
         def trained_errors(self, problem, now):
-            return error + self.change * one[model.columns(GAIN).start]
+            return error + self.change * one[model.columns(GAIN).start] + self.beside
 
     problem = SimpleNamespace(physics_dt=1e-3, with_physics_dt=lambda dt: None)
     stds = [
@@ -207,6 +207,10 @@ def test_a_value_that_joints_share_has_the_error_bar_of_them_all_and_of_the_step
     (with_step, _) = sizes(Fits(), ended(problem, alone), torch.ones(2), ("hip", "knee"))
     slope = float(model.box.slope(alone.x)[0, model.columns(GAIN).start])
     assert with_step["std"] == pytest.approx(np.hypot(stds[0][0], 0.01 * slope * 4 / 3), rel=1e-3)
+    # nothing of what no parameter makes up for is in the recording: this very step made it
+    monkeypatch.setattr(Fits, "beside", 0.1 * torch.randn(400, 1, 2, generator=generator))
+    (made_by_it, _) = sizes(Fits(), ended(problem, alone), torch.ones(2), ("hip", "knee"))
+    assert made_by_it["std"] == pytest.approx(stds[0][0], rel=1e-6)
 
 
 def test_the_covariance_of_white_noise_is_that_of_ordinary_least_squares():
