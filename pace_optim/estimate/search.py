@@ -11,7 +11,9 @@ from pace_optim.problem.rollout import Rollout
 def search(
     optimizer: CMAESOptimizer, rollout: Rollout, after_generation: Callable[[CMAESOptimizer], None] | None = None
 ) -> None:
-    """Evolve until the optimizer has finished, of several processes that of the one that writes.
+    """Evolve until the optimizer has finished.
+
+    Of several processes, the one that writes decides that.
 
     Args:
         after_generation: Called after each generation; it may call ``optimizer.stop``.

@@ -17,7 +17,7 @@ from pace_envs.lost_process import told_of_lost_processes
 _LOST_AFTER = timedelta(minutes=10)
 _LEISURE = timedelta(days=30)
 _at_leisure: dist.ProcessGroup | None = None
-"""The same processes, for one that waits until another has done work of its own."""
+"""The same processes, for waiting until the one that writes needs the others."""
 
 
 @dataclass(frozen=True)
