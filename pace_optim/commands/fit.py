@@ -128,8 +128,7 @@ def main() -> None:
             raise ValueError(missing_task())
         result, folder = fit_with_torques(FitSettings(**args, device=device), progress=progress, processes=processes)
     print(*summary(result), sep="\n")
-    interrupted = any("interrupted" in reason for reason in result.stop_reasons)
-    if then_diagnose and not interrupted:
+    if then_diagnose and not result.is_interrupted:
         from pace_optim.commands.diagnose import run_and_tell
         from pace_optim.diagnosis import DiagnosisSettings
 

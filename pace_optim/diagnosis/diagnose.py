@@ -161,6 +161,7 @@ def _refit(
             whole_values(final.model, final.x, problem.joint_names) | links, before.parameters, problem.unknown
         ),
         check_consistency=False,  # the run has done it
+        instead_of=None,
         log_dir=str(run.folder.absolute().parent.parent),
     )
     progress.restart()

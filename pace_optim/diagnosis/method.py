@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 
 import torch
@@ -24,14 +26,28 @@ from pace_optim.diagnosis.verdict.names import beside_curves, earned_names, new_
 from pace_optim.diagnosis.verdict.verdict import part_explained, verdict
 from pace_optim.joints.fits.base_fit import fit_base
 from pace_optim.joints.fits.block_errors import check_long_enough
-from pace_optim.joints.fits.denormals import flushed_denormals
 from pace_optim.joints.fits.fits import Fits, fits_on
 from pace_optim.joints.fits.reference_update import ReferenceUpdate
 from pace_optim.problem.problem import Problem
 from pace_optim.run.result import FitResult
 
 
-@flushed_denormals()
+@contextmanager
+def _flushed_denormals() -> Iterator[None]:
+    """Take denormal numbers for zeros meanwhile, in this thread and in processes forked from it.
+
+    States that decay to nothing make them, and they are slow. The processor's setting is put back at the end: it
+    belongs to the whole program, NumPy's and Python's numbers too.
+    """
+    before = sys.float_info.min / 2 == 0.0
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(before)
+
+
+@_flushed_denormals()
 def search_effects(
     problem: Problem,
     physical: torch.Tensor,

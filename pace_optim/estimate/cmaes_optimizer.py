@@ -54,12 +54,38 @@ class CMAESOptimizerCfg(Config):
         return cls() if robot.cmaes is None else robot.cmaes
 
 
-class TreeSearch:
-    """The strategies of all trees: vectors are drawn, and learnt from their scores; no simulator is known here.
+class CMAESOptimizer:
+    """Searches by CMA-ES: ``ask``, simulate, ``tell``, ``evolve``, until finished.
+
+        while not optimizer.finished():
+            optimizer.ask()
+            optimizer.update_simulator(rollout)
+            for sim_dof_pos, real_dof_pos in rollout:
+                optimizer.tell(sim_dof_pos, real_dof_pos)
+            optimizer.evolve()
+
+    The score of a candidate is the mean over the samples of Σ_joints (q_sim - bias - q_measured)² [rad²]; it is
+    accumulated during the rollout, positions are not stored.
 
     With several trees (groups of joints that do not influence each other) each has its own strategy on the same
     rollouts. Shared parameters (the delay) are searched by each tree on its own until the trees know theirs well; then
     the one value with the lowest total score is taken for all, and the search goes on with it.
+
+    Override :meth:`tell` for a custom objective, and name the class in ``fit --optimizer my_module:MyOptimizer``:
+
+        class PositionAndVelocity(CMAESOptimizer):
+            def tell(self, sim_dof_pos, real_dof_pos):
+                error_pos = torch.sum((sim_dof_pos - self.sim_params[:, self.bias_idx] - real_dof_pos) ** 2, dim=1)
+                error_vel = torch.sum((self.sim_dof_vel - self.real_dof_vel) ** 2, dim=1)
+                self.scores += 0.7 * error_pos + 0.3 * error_vel
+
+    Attributes:
+        armature_idx, damping_idx, friction_idx, bias_idx, delay_idx: Slices of the parameter vector.
+        sim_params: Physical parameters of every environment, (num_envs, size); set by :meth:`update_simulator`.
+        rollout: The rollout that is being scored.
+        generation: Generations so far.
+        history: Scores of each generation, (population_size, trees) [rad²].
+        best_scores: Best score so far after each generation [rad²].
     """
 
     def __init__(
@@ -67,17 +93,33 @@ class TreeSearch:
         space: ParameterSpace,
         population_size: int,
         cfg: CMAESOptimizerCfg,
-        processes: Processes,
         *,
-        trees: Sequence[Sequence[str]] | None,
-        seed: int,
-        start: torch.Tensor | None,
-        criteria: Sequence[Criterion] | None,
+        trees: Sequence[Sequence[str]] | None = None,
+        seed: int = 0,
+        start: torch.Tensor | None = None,
+        criteria: Sequence[Criterion] | None = None,
+        processes: Processes | None = None,
     ):
-        """Prepare the search; the arguments are those of :class:`CMAESOptimizer`."""
+        """Prepare the search.
+
+        Args:
+            trees: Groups of joint names that do not influence each other; ``None`` means one joint strategy.
+            start: Where to start, normalised (size,); ``None`` means the centre of the bounds.
+            criteria: When a strategy stops; ``None`` means PACE's, with ``cfg.epsilon``.
+            processes: Who shares the search: each process simulates its part of the candidates, and updates its
+                strategies; the other processes send their candidates and states.
+
+        Raises:
+            ValueError: If the population is too small.
+        """
+        if population_size < 4:
+            raise ValueError(
+                f"The population is {population_size}, expected at least 4 candidates. Raise --num_envs to at least "
+                "4 times the number of recordings."
+            )
         self.space = space
         self.cfg = cfg
-        self.processes = self._doers = processes
+        self.processes = self._doers = processes or Processes()
         self.population_size = population_size
         self.generation = 0
         self.history: list[np.ndarray] = []
@@ -110,8 +152,21 @@ class TreeSearch:
             )
         self._consensus: np.ndarray | None = None if len(groups) > 1 and self._shared else np.zeros(0)
         self._line: np.ndarray | None = None
-        self.line_generation = self._planned_line = -1
+        self.line_generation = -1
+        self._restored_line: int | None = None
         self._stopped: list[str] = []
+        self.armature_idx, self.damping_idx = space["armature"], space["viscous_friction"]
+        self.friction_idx, self.bias_idx = space["friction"], space["encoder_bias"]
+        self.delay_idx = space["delay"]
+        self.sim_params = torch.empty(0)
+        self.scores_buffer: torch.Tensor | None = None
+        self.rollout: Rollout | None = None
+        self._sample: tuple[int, torch.Tensor, torch.Tensor] | None = None
+        """A step, the errors that were added to ``scores`` there, and their weights."""
+        self.where: torch.Tensor | None = None
+        """Which samples are scored, (T, R) bool; ``None``: those to train on."""
+        self.joins_joints: bool | None = None
+        """Whether the last error was one per environment, not per joint; ``None`` before the first."""
 
     def ask(self) -> torch.Tensor:
         """Draw the next generation; physical parameters, (population_size, size)."""
@@ -195,7 +250,12 @@ class TreeSearch:
             history: The other one's ``history``: scores of each generation, (population_size, trees).
             line_generation: The other one's ``line_generation``.
         """
-        self._planned_line, self._doers = line_generation, Processes()  # each for itself: the others may not do it
+        if len(history) > self.cfg.max_iteration:
+            raise ValueError(
+                f"The search has had {len(history)} generations, more than max_iteration {self.cfg.max_iteration}. "
+                "Give it as many or more."
+            )
+        self._restored_line, self._doers = line_generation, Processes()  # each for itself: the others may not do it
         for scores in history:
             if scores.shape != (self.population_size, len(self.strategies)):
                 raise ValueError(
@@ -207,7 +267,7 @@ class TreeSearch:
             self._learn(np.asarray(scores))
             if after_generation is not None:
                 after_generation(self)
-        self._doers = self.processes
+        self._restored_line, self._doers = None, self.processes
 
     def _learn(self, scores: np.ndarray) -> None:
         self.generation_scores = scores
@@ -235,9 +295,9 @@ class TreeSearch:
 
     def _ready_for_consensus(self) -> bool:
         """Whether all trees know their shared parameters well, or time is running out."""
-        if self._planned_line >= 0:  # as in the run that is restored, whatever its max_iteration was
-            return self.generation == self._planned_line
-        if self.generation >= _CONSENSUS_LATEST * self.cfg.max_iteration:
+        if self._restored_line is not None:  # whatever max_iteration was
+            return self.generation == self._restored_line
+        if self.generation >= min(_CONSENSUS_LATEST * self.cfg.max_iteration, self.cfg.max_iteration - 1):
             return self.generation > 0
         known = [
             bool(s.stop_reason) or float(s.spread[self._positions(s)].max()) < _CONSENSUS_SPREAD
@@ -265,81 +325,6 @@ class TreeSearch:
             consensus = self._consensus is not None and len(self._consensus) > 0
             full[self._shared] = self._consensus if consensus else np.mean(values, axis=0)
         return torch.as_tensor(full)
-
-
-class CMAESOptimizer(TreeSearch):
-    """Searches by CMA-ES: ``ask``, simulate, ``tell``, ``evolve``, until finished.
-
-        while not optimizer.finished():
-            optimizer.ask()
-            optimizer.update_simulator(rollout)
-            for sim_dof_pos, real_dof_pos in rollout:
-                optimizer.tell(sim_dof_pos, real_dof_pos)
-            optimizer.evolve()
-
-    The score of a candidate is the mean over the samples of Σ_joints (q_sim - bias - q_measured)² [rad²]; it is
-    accumulated during the rollout, positions are not stored.
-
-    Override :meth:`tell` for a custom objective, and name the class in ``fit --optimizer my_module:MyOptimizer``:
-
-        class PositionAndVelocity(CMAESOptimizer):
-            def tell(self, sim_dof_pos, real_dof_pos):
-                error_pos = torch.sum((sim_dof_pos - self.sim_params[:, self.bias_idx] - real_dof_pos) ** 2, dim=1)
-                error_vel = torch.sum((self.sim_dof_vel - self.real_dof_vel) ** 2, dim=1)
-                self.scores += 0.7 * error_pos + 0.3 * error_vel
-
-    Attributes:
-        armature_idx, damping_idx, friction_idx, bias_idx, delay_idx: Slices of the parameter vector.
-        sim_params: Physical parameters of every environment, (num_envs, size); set by :meth:`update_simulator`.
-        rollout: The rollout that is being scored.
-        generation: Generations so far.
-        history: Scores of each generation, (population_size, trees) [rad²].
-        best_scores: Best score so far after each generation [rad²].
-    """
-
-    def __init__(
-        self,
-        space: ParameterSpace,
-        population_size: int,
-        cfg: CMAESOptimizerCfg,
-        *,
-        trees: Sequence[Sequence[str]] | None = None,
-        seed: int = 0,
-        start: torch.Tensor | None = None,
-        criteria: Sequence[Criterion] | None = None,
-        processes: Processes | None = None,
-    ):
-        """Prepare the search.
-
-        Args:
-            trees: Groups of joint names that do not influence each other; ``None`` means one joint strategy.
-            start: Where to start, normalised (size,); ``None`` means the centre of the bounds.
-            criteria: When a strategy stops; ``None`` means PACE's, with ``cfg.epsilon``.
-            processes: Who shares the search: each process simulates its part of the candidates, and updates its
-                strategies; the other processes send their candidates and states.
-
-        Raises:
-            ValueError: If the population is too small.
-        """
-        if population_size < 4:
-            raise ValueError(
-                f"The population is {population_size}, expected at least 4 candidates. Raise --num_envs to at least "
-                "4 times the number of recordings."
-            )
-        processes = processes or Processes()
-        super().__init__(space, population_size, cfg, processes, trees=trees, seed=seed, start=start, criteria=criteria)
-        self.armature_idx, self.damping_idx = space["armature"], space["viscous_friction"]
-        self.friction_idx, self.bias_idx = space["friction"], space["encoder_bias"]
-        self.delay_idx = space["delay"]
-        self.sim_params = torch.empty(0)
-        self.scores_buffer: torch.Tensor | None = None
-        self.rollout: Rollout | None = None
-        self._sample: tuple[int, torch.Tensor, torch.Tensor] | None = None
-        """A step, the errors that were added to ``scores`` there, and their weights."""
-        self.where: torch.Tensor | None = None
-        """Which samples are scored, (T, R) bool; ``None``: those to train on."""
-        self.joins_joints: bool | None = None
-        """Whether the last error was one per environment, not per joint; ``None`` before the first."""
 
     @property
     def num_shown(self) -> int:

@@ -19,7 +19,7 @@ class SearchState:
     scores: np.ndarray
     """Scores of the last generation, (population,) [rad²]."""
     best_scores: Sequence[float]
-    """Best score so far after each generation [rad²]."""
+    """Best score so far after each generation [rad²]; infinite until the trees share their delay."""
     spread: np.ndarray
     """Standard deviation of the search distribution, (parameters,), in normalised coordinates."""
 

@@ -55,7 +55,7 @@ class TreeStrategy:
     Attributes:
         best_x: The best candidate, normalised, (len(entries),).
         best_score: Its score [rad²].
-        best_scores: The best score after each generation [rad²].
+        best_scores: The best score after each generation [rad²]; infinite before the best was forgotten.
         stop_reason: Why it has stopped; ``None`` while it goes on.
         mean: Of the search distribution, normalised, inside the bounds.
         spread: Standard deviation of the search distribution, normalised.
@@ -136,6 +136,7 @@ class TreeStrategy:
     def forget_best(self) -> None:
         """Start over with the best, after what is simulated for a vector has changed."""
         self.best_score = np.inf
+        self.best_scores = [np.inf] * len(self.best_scores)
         self.stop_reason = None
 
 

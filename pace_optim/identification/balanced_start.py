@@ -66,8 +66,8 @@ def balanced_start(problem: Problem) -> tuple[torch.Tensor, float]:
     seen = [(view, Links.of(view)) for view in trained]
     counts = [moving(view, links) for view, links in seen]
     joints = _judged(counts)
-    values = {f"{name}/{link}": value for link, own in found.items() for name, value in own.items()}
-    best, late_by = np.inf, 0
+    of_links = {f"{name}/{link}": value for link, own in found.items() for name, value in own.items()}
+    best, late_by, of_joints = np.inf, 0, dict[str, float]()
     for delay in range(views[0].most_delay + 1) if joints else ():
         solved = [_solved(*_balance(seen, counts, j, delay), 0.5 * problem.control_dt) for j in joints]
         if (left := sum(part for _, part in solved)) >= best:
@@ -81,8 +81,7 @@ def balanced_start(problem: Problem) -> tuple[torch.Tensor, float]:
             # one at its bound is not known: from no friction at all, a descent may not get away
             known = {name: value for name, value in zip(_FOUND, numbers, strict=False) if value > 0}
             of_joints |= {f"{name}/{problem.joint_names[j]}": value for name, value in known.items()}
-        values |= of_joints
-    physical = space.to_physical(space.start)
+    values, physical = of_links | of_joints, space.to_physical(space.start)
     for i, label in enumerate(space.labels):
         physical[i] = values.get(label, float(physical[i]))
     start = space.to_normalised(physical).clamp(-1.0, 1.0)

@@ -12,9 +12,9 @@ from pace_actuators.effects import effect_modules
 from pace_actuators.text import listed
 from pace_envs.task_source import EnvironmentRecord
 from pace_optim.estimate.own_objective import optimizer_modules, use_recorded_optimizer
-from pace_optim.estimate.search import agree_to_stop, search
+from pace_optim.estimate.search import search
 from pace_optim.identification.conclude import conclude, conclude_own
-from pace_optim.identification.optimization import INTERRUPTED, Optimization, with_structures
+from pace_optim.identification.optimization import Optimization, with_structures
 from pace_optim.identification.setup import load_for_fit, make_optimizer, make_searcher
 from pace_optim.problem.recordings import tell_nobody, tell_on_stderr
 from pace_optim.recording.torque import NoTorqueError
@@ -114,20 +114,25 @@ def fit_with_torques(
 
 
 def _by_torques(
-    first: FitResult, folder: Path, settings: FitSettings, progress: ProgressLine, processes: Processes | None
+    first: FitResult,
+    folder: Path,
+    settings: FitSettings,
+    progress: ProgressLine,
+    processes: Processes | None,
+    beside: bool = True,
 ) -> tuple[FitResult, Path]:
-    """A fit of positions, or the better one by its torques."""
+    """A fit of positions, or the better one by its torques: ``beside`` the positions, then by their values alone."""
     several = processes is not None and processes.count > 1
     depends = bool(first.contested or first.from_torques)
-    if several or not depends or INTERRUPTED in first.stop_reasons or (first.times_noise or 0.0) < _NOISY:
+    if several or not depends or first.is_interrupted or (first.times_noise or 0.0) < _NOISY:
         return first, folder
-    for facts, other in _attempts(first, folder, settings):
+    for facts, other in _attempts(first, folder, settings, beside):
         progress.tell(f"The fit is at {first.times_noise:.3g} times the noise: fitting with {facts}.")
         try:
             result, path = fit(other, progress, tell=tell_nobody)
         except NoTorqueError:
             continue
-        if INTERRUPTED in result.stop_reasons:
+        if result.is_interrupted:
             progress.tell(f"The fit with {facts} was broken off: {command('fit')} --resume {shlex.quote(str(path))}.")
             return first, folder
         if _is_better(result, first, facts, progress):
@@ -135,11 +140,11 @@ def _by_torques(
     return first, folder
 
 
-def _attempts(first: FitResult, folder: Path, settings: FitSettings) -> Iterator[tuple[str, FitSettings]]:
-    """What is fitted by torques, in words and as settings: beside positions, then by their values alone."""
+def _attempts(first: FitResult, folder: Path, settings: FitSettings, beside: bool) -> Iterator[tuple[str, FitSettings]]:
+    """What is fitted by torques, in words and as settings."""
     unknown = [*settings.unknown, *(fact for fact in first.contested if fact not in settings.unknown)]
     other = replace(settings, unknown=unknown, instead_of=str(folder.absolute()))
-    if not settings.residual and not settings.only_searches:
+    if beside and not settings.residual and not settings.only_searches:
         facts = listed([*first.contested, *first.from_torques])
         yield f"torques beside positions, as {facts} depend on them", replace(other, residual=["position", "effort"])
     if first.contested:
@@ -185,7 +190,7 @@ def resume(
     folder = RunFolder(Path(path))
     checkpoint = folder.read_checkpoint()
     read_bounds(folder.path)
-    ended = (folder.path / "result.json").exists() and INTERRUPTED not in FitResult.load(folder.path).stop_reasons
+    ended = (folder.path / "result.json").exists() and not FitResult.load(folder.path).is_interrupted
     if (folder.path / "result.json").exists():  # its report is made of more
         check_folder(folder.path)
     before = _reopened(folder.path, settings, task)
@@ -198,12 +203,17 @@ def resume(
     run = Optimization(settings, problem, folder, progress or ProgressLine(), processes)
     run.restore(checkpoint)
     result, path = _finished(run, before.record)
-    if ended or INTERRUPTED in result.stop_reasons:
+    if ended or result.is_interrupted:
         return result, path
     if settings.instead_of is None:
         return _by_torques(result, path, settings, run.progress, processes)
-    first = FitResult.load(settings.instead_of)
-    return (result, path) if _is_better(result, first, "torques", run.progress) else (first, Path(settings.instead_of))
+    first, place = FitResult.load(settings.instead_of), Path(settings.instead_of)
+    if _is_better(result, first, "torques", run.progress):
+        return result, path
+    stated = FitSettings.load(place / "settings.json")[0].residual
+    if stated == settings.residual:
+        return first, place
+    return _by_torques(first, place, replace(settings, residual=stated), run.progress, processes, beside=False)
 
 
 def help_fit(processes: Processes, device: str, path: str | None = None, task: str | None = None) -> None:
@@ -213,10 +223,10 @@ def help_fit(processes: Processes, device: str, path: str | None = None, task: s
         path: The run's folder, if it is resumed.
         task: As for :func:`resume`.
     """
-    start: Any = processes.agree(None)
+    start: Any = processes.agree(None, at_leisure=True)
     if start is None:
         return
-    settings, around, history, line_generation, loop = start
+    settings, around, history, line_generation, max_iteration, loop = start
     settings = replace(settings, device=device)
     env_cfg = None if path is None else _reopened(Path(path), settings, task).load_cfg()
     problem = load_for_fit(settings, env_cfg, tell_nobody)
@@ -225,8 +235,9 @@ def help_fit(processes: Processes, device: str, path: str | None = None, task: s
         problem = with_structures(problem, None, around)
     searcher = make_searcher(problem, settings)
     optimizer = make_optimizer(problem, settings, processes, around if len(around) else None)
+    optimizer.cfg = replace(optimizer.cfg, max_iteration=max_iteration)
     optimizer.restore(history, line_generation)
-    search(optimizer, searcher.rollout(optimizer.num_shown), lambda _: agree_to_stop(optimizer, processes))
+    search(optimizer, searcher.rollout(optimizer.num_shown))
 
 
 def _reopened(path: Path, settings: FitSettings, task: str | None) -> Run:

@@ -19,7 +19,7 @@ from pace_optim.estimate.error_bars.loop_rate import UNEXPLAINED
 from pace_optim.estimate.error_bars.uncertainty import torque_noise
 from pace_optim.estimate.error_bars.undetermined import at_prior
 from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, by_chords
-from pace_optim.estimate.search import agree_to_stop, search
+from pace_optim.estimate.search import search
 from pace_optim.estimate.way_down import PIECES, WHOLE, WayDown
 from pace_optim.identification.balanced_start import balanced_start
 from pace_optim.identification.setup import make_optimizer, make_searcher
@@ -389,7 +389,7 @@ class Optimization:
             searches = self.settings.optimizer != "least_squares"
             end = self.way.run(starts, self._search_within if searches else None)
         if not self._searched:
-            self.processes.agree(None)  # there was nothing to share: the others may go
+            self.processes.agree(None, at_leisure=True)  # there was nothing to share: the others may go
         return self._ended(self.way, end)
 
     def _first(self) -> torch.Tensor:
@@ -413,7 +413,8 @@ class Optimization:
     def _make_optimizer(self) -> CMAESOptimizer:
         """The search; a hybrid's is made when it begins."""
         if self.optimizer is None:
-            self.optimizer = make_optimizer(self.problem, self.settings, self.processes, self._around)
+            problem = with_structures(self.problem, None, self._around)  # those of a run that is resumed
+            self.optimizer = make_optimizer(problem, self.settings, self.processes, self._around)
         return self.optimizer
 
     def _search_within(self, budget: int, x: torch.Tensor) -> list[torch.Tensor]:
@@ -438,16 +439,12 @@ class Optimization:
 
     def _search(self, optimizer: CMAESOptimizer) -> torch.Tensor:
         """Run CMA-ES as far as an interrupted run had not; returns the best."""
-
-        def after_generation(_: CMAESOptimizer) -> None:
-            self._after_generation(optimizer)
-            agree_to_stop(optimizer, self.processes)
-
         self._searched = True
-        loop = self.problem.loop_dt if self.problem.assumes_loop_rate else None
-        self.processes.agree((self.settings, self._around, optimizer.history, optimizer.line_generation, loop))
+        begun, loop = optimizer.history, self.problem.loop_dt if self.problem.assumes_loop_rate else None
+        known = self.settings, self._around, begun, optimizer.line_generation, optimizer.cfg.max_iteration, loop
+        self.processes.agree(known, at_leisure=True)
         self.progress.say(f"{self._search_name}: {optimizer.population_size} candidates in a generation")
-        search(optimizer, self.searcher.rollout(optimizer.num_shown), after_generation)
+        search(optimizer, self.searcher.rollout(optimizer.num_shown), self._after_generation)
         optimizer.close()
         self._search_stop = optimizer.stop_reasons
         self._write_mean(optimizer)

@@ -130,7 +130,11 @@ class ParameterSpace:
             at = [f"{p.name}/{key}" in held for key in p.keys]
             lower = tuple(v if yes else low for v, yes, low in zip(own, at, p.lower, strict=True))
             upper = tuple(v if yes else high for v, yes, high in zip(own, at, p.upper, strict=True))
-            parameters.append(replace(p, lower=lower, upper=upper, start=None))
+            start = p.start
+            if start is not None:
+                stated = start if isinstance(start, tuple) else (start,) * len(p.keys)
+                start = tuple(v if yes else s for v, yes, s in zip(own, at, stated, strict=True))
+            parameters.append(replace(p, lower=lower, upper=upper, start=start))
         return ParameterSpace(parameters)
 
     @property

@@ -151,6 +151,11 @@ class FitResult(DriveResult):
         return [name for name in (TORQUE_SCALE, TORQUE_OFFSET) if name in self.parameters]
 
     @property
+    def is_interrupted(self) -> bool:
+        """Whether the fit, or its checks, was interrupted."""
+        return any("interrupted" in reason for reason in self.stop_reasons)
+
+    @property
     def joint_types(self) -> tuple[JointType, ...]:
         """Whether each joint turns or slides."""
         return tuple(self.joint_type(joint) for joint in self.joint_names)

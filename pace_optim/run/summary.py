@@ -107,7 +107,7 @@ def next_lines(result: FitResult, folder: Path, *, diagnosed: bool = False) -> l
         diagnosed: Whether that is the end of a diagnosis.
     """
     run = shlex.quote(str(folder))
-    if any("interrupted" in reason for reason in result.stop_reasons):
+    if result.is_interrupted:
         return [f"next: {command('fit')} --resume {run}"]
     if result.times_noise is None and not diagnosed:
         return []

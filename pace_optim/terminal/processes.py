@@ -15,6 +15,9 @@ import torch.distributed as dist
 from pace_envs.lost_process import told_of_lost_processes
 
 _LOST_AFTER = timedelta(minutes=10)
+_LEISURE = timedelta(days=30)
+_at_leisure: dist.ProcessGroup | None = None
+"""The same processes, for waiting until the one that writes needs the others."""
 
 
 @dataclass(frozen=True)
@@ -57,12 +60,12 @@ class Processes:
         _together(lambda: dist.all_reduce(whole))  # each row has one process that is not zero: the sum is exact
         return whole
 
-    def agree(self, value: Any) -> Any:
-        """What the writing process has, in all of them."""
+    def agree(self, value: Any, at_leisure: bool = False) -> Any:
+        """What the writing process has, in all of them; ``at_leisure`` the others wait as long as it takes."""
         if self.count == 1:
             return value
-        held = [value]
-        _together(lambda: dist.broadcast_object_list(held, src=0))
+        held, group = [value], _at_leisure if at_leisure else None
+        _together(lambda: dist.broadcast_object_list(held, src=0, group=group))
         return held[0]
 
 
@@ -75,9 +78,11 @@ def join(device: str = "cpu") -> tuple[Processes, str]:
     count = int(os.environ.get("WORLD_SIZE", "1"))
     if count == 1:
         return Processes(), device
+    global _at_leisure
     own = own_device(device)
     if not dist.is_initialized():  # scores are few numbers: by gloo, which reports a lost process at once
         _together(lambda: dist.init_process_group("gloo", timeout=_LOST_AFTER))
+        _at_leisure = dist.new_group(timeout=_LEISURE)
         atexit.register(_leave)
     return Processes(rank=dist.get_rank(), count=dist.get_world_size()), own
 

@@ -82,7 +82,7 @@ def test_it_works_on_a_run_of_another_robot_from_another_folder(line, run, tmp_p
 
 @pytest.mark.parametrize(("interrupted", "diagnosed"), [(False, True), (True, False)])
 def test_a_fit_goes_on_to_the_diagnosis_of_its_run(interrupted, diagnosed, run, tmp_path, monkeypatch):
-    ended = SimpleNamespace(stop_reasons=["interrupted" if interrupted else "converged"])
+    ended = SimpleNamespace(is_interrupted=interrupted)
     asked = []
     monkeypatch.setattr("pace_optim.run.summary.summary", lambda _: [])
     monkeypatch.setattr("pace_optim.identification.fit.fit_with_torques", lambda settings, **_: (ended, run))

@@ -20,7 +20,7 @@ from pace_optim.joints.simulation.problem import TwinProblem
 from pace_optim.problem.problem import Problem
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import session_starts
-from pace_optim.recording.noise import noise_floor
+from pace_optim.recording.noise import NoiseFloor, noise_floor
 from pace_optim.run.result import FitResult
 
 
@@ -33,8 +33,6 @@ class DataCheck:
     is raised to what the base model leaves here: the recording is of a simulation."""
     noise: torch.Tensor
     """(n,) [rad]."""
-    numerical: torch.Tensor
-    """Change when the physics step is halved, (n,) [rad]."""
     sentences: list[str] = field(default_factory=list)
     loads: int = 1
     """Number of different loads."""
@@ -42,16 +40,16 @@ class DataCheck:
     """Number of different gains."""
 
 
-def encoder_steps(recordings: Sequence[Recording], names: Sequence[str]) -> dict[str, float]:
+def noise_floors(recordings: Sequence[Recording]) -> list[list[NoiseFloor]]:
+    """The noise of each joint in each recording."""
+    every = [(recording.dof_pos.T, float(np.median(np.diff(recording.time)))) for recording in recordings]
+    return [[noise_floor(position, dt) for position in positions] for positions, dt in every]
+
+
+def encoder_steps(floors: Sequence[Sequence[NoiseFloor]], names: Sequence[str]) -> dict[str, float]:
     """The steps of positions, {joint: rad}; those finer than the noise are the last digit of a file."""
-    steps = {}
-    for recording in recordings:
-        dt = float(np.median(np.diff(recording.time)))
-        for j, name in enumerate(names):
-            floor = noise_floor(recording.dof_pos[:, j], dt)
-            if floor.lattice is not None and floor.lattice > floor.sigma:
-                steps[name] = floor.lattice
-    return steps
+    every = ((name, floor) for own in floors for name, floor in zip(names, own, strict=True))
+    return {name: floor.lattice for name, floor in every if floor.lattice is not None and floor.lattice > floor.sigma}
 
 
 def check_data(
@@ -75,18 +73,15 @@ def check_data(
         cfg: What is at the floor.
     """
     data, names, types = problem.dataset, problem.joint_names, problem.joint_types
-    squares = []
-    for recording in data.recordings:
-        dt = float(np.median(np.diff(recording.time)))
-        squares.append([noise_floor(recording.dof_pos[:, j], dt).sigma ** 2 for j in range(len(names))])
-    noise = torch.tensor(np.sqrt(np.mean(squares, axis=0)))
+    floors = noise_floors(data.recordings)
+    noise = torch.tensor(np.sqrt(np.mean([[each.sigma**2 for each in own] for own in floors], axis=0)))
     numerical = step_error(*whole_robot(problem, base), data.validation)
     sentences = [
         f"Measurement noise: {_by_type(noise, types, _span)}; halving "
         f"the physics step of {1e3 * problem.physics_dt:g} ms changes the simulation by up to "
         f"{_by_type(numerical, types, _largest)}.",
     ]
-    if steps := encoder_steps(data.recordings, names):
+    if steps := encoder_steps(floors, names):
         coarse = max(steps, key=lambda name: steps[name])
         unit = units_for("mrad", [types[names.index(coarse)]])
         sentences.append(f"The encoders show steps, the largest {1e3 * steps[coarse]:.2g} {unit} ({coarse}).")
@@ -115,7 +110,6 @@ def check_data(
     return DataCheck(
         floor=floor,
         noise=noise,
-        numerical=numerical,
         sentences=sentences,
         loads=len(loads),
         gains=len(gains),

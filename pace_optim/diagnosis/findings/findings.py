@@ -24,7 +24,7 @@ from pace_optim.diagnosis.selection.naming import DIFFERS
 from pace_optim.diagnosis.verdict.free_curves import Curves, error_map
 from pace_optim.diagnosis.verdict.names import Hint, new_effects
 from pace_optim.diagnosis.verdict.refit import Evidences, judged_again, on_whole_robot
-from pace_optim.diagnosis.verdict.sizes import factor_of, sizes, without_error_bars
+from pace_optim.diagnosis.verdict.sizes import size_of, sizes, without_error_bars
 from pace_optim.diagnosis.verdict.verdict import likes, part_explained, ranking, restricted, verdict
 from pace_optim.diagnosis.wrong_links import LinkFindings
 from pace_optim.joints.fits.fits import Fits
@@ -251,12 +251,9 @@ def _as_refitted(size: dict[str, Any], refit: FitResult, unsure: bool) -> dict[s
         return size
     effect = get_effect(size["effect"])
     (parameter,) = (each for each in effect.parameters if each.name == size["parameter"])
-    return size | {
-        "value": values[key],
-        "std": None if refit.std_means_nothing or unsure else refit.std[name][key],
-        "factor": None if size["factor"] is None else factor_of(effect, parameter, values[key]),
-        "at_bound": f"{name}/{key}" in refit.at_bound,
-    }
+    std = None if refit.std_means_nothing or unsure else refit.std[name][key]
+    at_bound = f"{name}/{key}" in refit.at_bound
+    return size | size_of(effect, parameter, values[key], std, refit.joint_type(joint), at_bound)
 
 
 def _about_run(found: Findings, problem: Problem, run: FitResult) -> list[str]:

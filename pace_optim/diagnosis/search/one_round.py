@@ -104,7 +104,8 @@ def _begin(search: Search, branch: Branch) -> tuple[dict[type[Effect], Fitted], 
     seen = fits.looked_at(problem.in_windows(), [replace(now, tried=None)])[0]
     probes = screen(fits, problem.coarse(), seen, effects, search.effort, cfg)
     excess = (errors.mse - search.at_floor**2).clamp(min=0.0)
-    listed = with_likes(_short_list(_promising(probes, excess, cfg.explains), excess, cfg), effects)
+    promising = _promising(probes, excess, cfg.explains)
+    listed = with_likes(_short_list(promising, excess, search.at_floor, cfg), effects)
     far = bool((errors.mse.sqrt() > cfg.beyond_screening * search.floor).any())
     wide = search.own.issuperset(now.model.effects) or far
     always = [effect for effect in search.begun if effect in effects]
@@ -114,7 +115,8 @@ def _begin(search: Search, branch: Branch) -> tuple[dict[type[Effect], Fitted], 
     search.say(f"fitting {f'{len(begin)} effects' if wide else _names(begin)} on windows")
     begun = _begun(search, branch, probes, begin, far and search.cfg.has("multistart"))
     if wide:
-        listed = with_likes([*_short_list(_gained(begun), excess, cfg), *listed[: cfg.from_screening]], effects)
+        gained = _short_list(_gained(begun), excess, search.at_floor, cfg)
+        listed = with_likes([*gained, *listed[: cfg.from_screening]], effects)
     listed = list(dict.fromkeys([*listed, *always]))
     # where nothing is listed no effect does better than the base parameters alone
     return {effect: begun[effect] for effect in listed}, probes
@@ -165,18 +167,20 @@ def _promising(probes: Sequence[Probe], excess: torch.Tensor, least: float) -> d
 
 
 def _short_list(
-    explained: Mapping[type[Effect], torch.Tensor], excess: torch.Tensor, cfg: CandidatesCfg
+    explained: Mapping[type[Effect], torch.Tensor], excess: torch.Tensor, floor: torch.Tensor, cfg: CandidatesCfg
 ) -> list[type[Effect]]:
-    """Effects that explain most of the whole robot's error, then those that explain most of the worst joints'.
+    """Effects that explain most of the robot's error, in floors, then those that explain most of the worst joints'.
 
     Args:
         explained: Squared error that each effect explains of each joint, (n,).
         excess: Squared error of each joint that could be explained, (n,); zero where there is nothing to find.
+        floor: RMSE of each joint below which there is nothing to find, (n,).
         cfg: How many are wanted.
     """
-    total = {effect: float(values[excess > 0].sum()) for effect, values in explained.items()}
+    weight = floor.square().clamp(min=1e-300).reciprocal()
+    total = {effect: float((values * weight)[excess > 0].sum()) for effect, values in explained.items()}
     wanted = sorted((e for e in total if total[e] > 0), key=lambda e: -total[e])[: cfg.of_robot]
-    for j in excess.argsort(descending=True)[: cfg.of_joint].tolist():
+    for j in (excess * weight).argsort(descending=True)[: cfg.of_joint].tolist():
         own = sorted((e for e in explained if explained[e][j] > 0), key=lambda e: -float(explained[e][j]))
         wanted += own[: cfg.of_joint]
     return list(dict.fromkeys(wanted))

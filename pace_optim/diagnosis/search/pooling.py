@@ -17,17 +17,20 @@ _RIDGE = 1e-12
 
 
 def pool(fits: Fits, outcome: Outcome, log: Log = unlogged) -> Outcome:
-    """Give each effect found on several joints one value for all of them, where that explains as much.
+    """Give each effect found on several joints of one type one value for all of them, where that explains as much.
 
     The value is the joints' mean, weighted by how well each is known beside its other parameters (the Schur
-    complement of the Gauss–Newton matrix); the other parameters are fitted again with it held.
+    complement of the Gauss–Newton matrix, over the squared error); the other parameters are fitted again with it held.
     """
     if outcome.final.jacobian is None and outcome.cfg.has("pool"):
         outcome = replace(outcome, final=fits.looked_at(outcome.problem, [outcome.final])[0])
     for effect, has in zip(outcome.final.model.effects, outcome.final.model.has, strict=True):
+        types = {outcome.final.model.joint_type(j) for j in has.nonzero()[:, 0].tolist()}
         if not outcome.cfg.has("pool") or effect.shared or effect in outcome.base.model.effects or int(has.sum()) < 2:
             continue
-        held = _held(outcome.final, effect, has)
+        if len(types) > 1:
+            continue
+        held = _held(outcome, effect, has)
         fitted = fits.side_by_side(outcome.problem, [held], fits.cfg.again, keep_jacobian=True)[0]
         errors = fits.validation_errors(outcome.problem, [fitted])[0]
         joints = has.nonzero()[:, 0].tolist()
@@ -36,10 +39,10 @@ def pool(fits: Fits, outcome: Outcome, log: Log = unlogged) -> Outcome:
     return outcome
 
 
-def _held(now: Fitted, effect: type[Effect], has: torch.Tensor) -> Fitted:
+def _held(outcome: Outcome, effect: type[Effect], has: torch.Tensor) -> Fitted:
     """The model with the effect's values held at the joints' common one."""
-    model, columns = now.model, now.model.columns(effect)
-    common = _common(now, columns, has)
+    now, model, columns = outcome.final, outcome.final.model, outcome.final.model.columns(effect)
+    common = _common(now, columns, has, outcome.final_errors.mse)
     physical = now.physical
     at = model.to_normalised(physical)
     at[has, columns] = common
@@ -49,8 +52,8 @@ def _held(now: Fitted, effect: type[Effect], has: torch.Tensor) -> Fitted:
     return Fitted.start(replace(model, lower=lower, upper=upper), physical)
 
 
-def _common(now: Fitted, columns: slice, has: torch.Tensor) -> torch.Tensor:
-    """Weighted mean of the normalised values, (parameters,)."""
+def _common(now: Fitted, columns: slice, has: torch.Tensor, mse: torch.Tensor) -> torch.Tensor:
+    """Mean of the normalised values, (parameters,), weighted by what is known of them beside squared errors (n,)."""
     if now.jacobian is None:
         raise ValueError("Pooling needs a model that was fitted with keep_jacobian.")
     size = now.model.size
@@ -60,7 +63,7 @@ def _common(now: Fitted, columns: slice, has: torch.Tensor) -> torch.Tensor:
     moment = torch.zeros(len(own), dtype=torch.float64)
     for j in has.nonzero()[:, 0].tolist():
         rows = now.jacobian[..., j].flatten(1).double()
-        gram = rows @ rows.T
+        gram = rows @ rows.T / mse[j].clamp(min=1e-300)
         gram = gram + _RIDGE * gram.diagonal().max() * torch.eye(size, dtype=torch.float64)
         cross = gram[own[:, None], others]
         known = gram[own[:, None], own] - cross @ torch.linalg.solve(gram[others[:, None], others], cross.T)

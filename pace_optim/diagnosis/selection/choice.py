@@ -52,9 +52,9 @@ def _worse_for_the_robot(trials: Sequence[Sequence[Trial]]) -> set[type[Effect]]
     before = [own[0].mse_before for own in trials if own]
 
     def left(effects: set[type[Effect]]) -> float:
-        """Squared error over all joints with the best of some effects."""
+        """Part of its squared error that the best of some effects leaves on each joint, summed."""
         return sum(
-            min([without, *(t.mse_after for t in own if t.effect in effects)])
+            min([1.0, *(t.mse_after / without for t in own if t.effect in effects)])
             for own, without in zip(good, before, strict=True)
         )
 

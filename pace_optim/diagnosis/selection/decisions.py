@@ -104,14 +104,16 @@ def _content(each: Decision) -> dict[str, Any]:
     }
 
 
-def _digits(errors: BlockErrors) -> list[list[float]]:
-    """Mean square error of each block [rad²], joint by joint."""
-    return [[float(f"{value:.8g}") for value in own] for own in errors.square.T.tolist()]
+def _digits(errors: BlockErrors) -> list[list[float | None]]:
+    """Mean square error of each block [rad²], joint by joint; ``None`` for blocks that a joint does not have."""
+    every = errors.square.T.tolist()
+    return [[None if math.isnan(value) else float(f"{value:.8g}") for value in own] for own in every]
 
 
 def _decision(weight: list[float], before: list, after: dict[str, list], **others: Any) -> Decision:
     def errors(square: list) -> BlockErrors:
-        rows = [[math.nan] * len(weight) if own is None else own for own in square]
+        nothing = [None] * len(weight)
+        rows = [[math.nan if value is None else value for value in own or nothing] for own in square]
         return BlockErrors(square=torch.tensor(rows).double().T, weight=torch.tensor(weight).double())
 
     return Decision(before=errors(before), after={name: errors(own) for name, own in after.items()}, **others)

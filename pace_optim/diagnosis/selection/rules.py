@@ -64,7 +64,8 @@ def _replace(decision: Decision, cfg: DiagnosisCfg) -> Taken:
         options = {name: float(decision.after[name].mse[place]) for name in here}
         options |= {olds[name][str(j)]: float(decision.before.mse[place]) for name in here}
         least = min(options.values())
-        near.append({name: mse for name, mse in options.items() if within(mse, least, cfg.judging.alike)})
+        alike = {name: mse for name, mse in options.items() if within(mse, least, cfg.judging.alike)}
+        near.append({name: mse / max(least, 1e-300) for name, mse in alike.items()})
     wanted = Counter(name for options in near for name in options)
     wanted.update(name for j, own in enumerate(has) if j not in joints for name in own)
     used = Counter(name for own in has for name in own)
@@ -74,9 +75,9 @@ def _replace(decision: Decision, cfg: DiagnosisCfg) -> Taken:
 
 
 def _pool(decision: Decision, cfg: DiagnosisCfg) -> Taken:
-    """One value for all joints, where that is as good over all of them."""
+    """One value for all joints, where their squared errors rise by as much as is alike, in their mean."""
     ((name, after),) = decision.after.items()
-    taken = within(float(after.mse.sum()), float(decision.before.mse.sum()), cfg.judging.alike)
+    taken = within(float((after.mse / decision.before.mse).nan_to_num(nan=1.0).mean()), 1.0, cfg.judging.alike)
     return [name if taken else None for _ in decision.joints]
 
 

@@ -23,8 +23,8 @@ def unevenness(now: Fitted) -> torch.Tensor:
         now: A model, fitted, with its Jacobian.
 
     Returns:
-        (effects, n); zero where a joint does not have the effect. Halves of recordings stand for recordings where
-        there are one or two: of two sizes nothing says which is right.
+        (effects, n); zero where a joint does not have the effect. Halves of two recordings, or quarters of one, stand
+        for recordings: of two sizes nothing says which is right.
 
     Raises:
         ValueError: If there is no Jacobian.
@@ -50,7 +50,7 @@ def unevenness(now: Fitted) -> torch.Tensor:
 def sizes_apart(now: Fitted, effect: type[Effect], joint: int) -> torch.Tensor:
     """An effect's sizes on a joint if each recording had its own, to first order, physical (R, parameters).
 
-    Halves of recordings stand for one or two recordings, as in :func:`unevenness`.
+    Parts stand for one or two recordings, as in :func:`unevenness`.
     """
     columns = now.model.columns(effect)
     jacobian, error = _in_parts(now.free_jacobian)[..., joint].double(), now.error
@@ -69,7 +69,7 @@ def sizes_apart(now: Fitted, effect: type[Effect], joint: int) -> torch.Tensor:
 
 
 def _in_parts(values: torch.Tensor) -> torch.Tensor:
-    """Values (…, K, R, n) with halves of recordings in place of them, as long as there are no more than two."""
+    """Values (…, K, R, n), recordings cut in halves as long as there are no more than two."""
     while values.shape[-2] <= 2:
         *_, samples, _, _ = values.shape
         half = samples // 2

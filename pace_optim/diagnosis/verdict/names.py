@@ -14,7 +14,7 @@ from pace_optim.diagnosis.selection.decisions import Log, unlogged
 from pace_optim.diagnosis.selection.naming import CURVE_LEAVES_LESS, Evidence, doubts
 from pace_optim.diagnosis.selection.rules import decide
 from pace_optim.diagnosis.selection.size_consistency import sizes_apart, unevenness
-from pace_optim.diagnosis.verdict.sizes import error_bars_from_none, factor_of, standard_deviations
+from pace_optim.diagnosis.verdict.sizes import error_bars_from_none, size_of, standard_deviations
 from pace_optim.joints.fits.block_errors import BlockErrors
 from pace_optim.joints.fits.fits import Fits
 from pace_optim.joints.fits.fitted import Fitted
@@ -290,15 +290,8 @@ def hint(
         std = torch.zeros_like(now.x) if now.jacobian is None else standard_deviations(now)
     apart = None if now.jacobian is None else sizes_apart(now, effect, joint)
     sizes = [
-        {
-            "parameter": parameter.name,
-            "value": value,
-            "std": error or None,
-            "unit": parameter.unit,
-            "factor": factor_of(effect, parameter, value),
-            "at_bound": False,
-            "apart": None if apart is None else [float(apart[:, p].min()), float(apart[:, p].max())],
-        }
+        size_of(effect, parameter, value, error, now.model.joint_type(joint))
+        | {"apart": None if apart is None else [float(apart[:, p].min()), float(apart[:, p].max())]}
         for p, (parameter, value, error) in enumerate(
             zip(effect.parameters, now.physical[joint, columns].tolist(), std[joint, columns].tolist(), strict=True)
         )

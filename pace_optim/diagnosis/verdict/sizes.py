@@ -8,8 +8,9 @@ from typing import Any
 import torch
 
 from pace_actuators.effects import Effect, EffectParameter
+from pace_actuators.joint_units import JointType, units_for
 from pace_optim.diagnosis.search.state import Outcome
-from pace_optim.estimate.error_bars.physics_step import FINER, TO_NO_STEP
+from pace_optim.estimate.error_bars.physics_step import FINER, TO_NO_STEP, has_no_step
 from pace_optim.estimate.error_bars.uncertainty import ANYWHERE, sandwich
 from pace_optim.joints.fits.fits import Fits
 from pace_optim.joints.fits.fitted import Fitted
@@ -48,20 +49,32 @@ def sizes(fits: Fits, outcome: Outcome, floor: torch.Tensor, joint_names: tuple[
             std[has, columns] = std[has, columns].pow(-2).sum(dim=0).pow(-0.5)
         for j in has.nonzero()[:, 0].tolist():
             values = (each[j, columns].tolist() for each in (now.physical, std, stuck))
+            kind = now.model.joint_type(j)
             result += [
-                {
-                    "effect": effect.name,
-                    "parameter": parameter.name,
-                    "joint": joint_names[j],
-                    "value": value,
-                    "std": error if error > 0 and not unsure[j] else None,
-                    "unit": parameter.unit,
-                    "factor": factor_of(effect, parameter, value),
-                    "at_bound": held_back,
-                }
+                {"effect": effect.name, "parameter": parameter.name, "joint": joint_names[j]}
+                | size_of(effect, parameter, value, None if unsure[j] else error, kind, held_back)
                 for parameter, value, error, held_back in zip(effect.parameters, *values, strict=True)
             ]
     return result
+
+
+def size_of(
+    effect: type[Effect],
+    parameter: EffectParameter,
+    value: float,
+    std: float | None,
+    joint_type: JointType,
+    at_bound: bool = False,
+) -> dict[str, Any]:
+    """The size of an effect's parameter on a joint, with an error bar if that is not zero."""
+    return {
+        "parameter": parameter.name,
+        "value": value,
+        "std": std or None,
+        "unit": units_for(parameter.unit, [joint_type]),
+        "factor": factor_of(effect, parameter, value),
+        "at_bound": at_bound,
+    }
 
 
 def without_error_bars(outcome: Outcome, floor: torch.Tensor) -> torch.Tensor:
@@ -103,7 +116,7 @@ def standard_deviations(now: Fitted) -> torch.Tensor:
 def _step_shares(fits: Fits, problem: TwinProblem, now: Fitted) -> torch.Tensor:
     """The part of each value that makes up for the physics step, physical (n, P), as in a fit's ``step_share``.
 
-    The errors change by c without a step, and a fit would then move by - (JᵀJ)⁻¹ Jᵀ c.
+    The errors change by c without a step, and a fit would then move by - (JᵀJ)⁻¹ Jᵀ c, if the recording has no step.
     """
     columns, error, result = now.free_jacobian, now.error, torch.zeros_like(now.x)
     if error is None:
@@ -114,7 +127,9 @@ def _step_shares(fits: Fits, problem: TwinProblem, now: Fitted) -> torch.Tensor:
         own = columns[..., j].double().flatten(1)
         free = own.norm(dim=1).nonzero()[:, 0]
         move = torch.linalg.lstsq(own[free].T, change[..., j].flatten()[:, None], driver="gelsd").solution[:, 0]
-        result[j, free] = move
+        left = change[..., j] - (move @ own[free]).view_as(change[..., j])
+        if has_no_step(error[..., j, None].double(), left[..., None], torch.ones_like(left, dtype=torch.bool)):
+            result[j, free] = move
     return result * now.model.box.slope(now.x)
 
 

@@ -79,21 +79,27 @@ def step_share(
     inverse, _ = inverse_of(hessian.numpy()[np.ix_(free, free)])
     move = torch.zeros(space.size, dtype=torch.float64)
     move[free] = torch.from_numpy(-inverse @ there.transposed_times(change).numpy()[free])
-    if not _has_no_step(there, change + there.times(move)):
+    if not has_no_step(there.residuals.error[0], change + there.times(move), there.residuals.where):
         return result
     result[free] = -(move * space.slope(x)).numpy()[free]
     return result
 
 
-def _has_no_step(there: Jacobian, left: torch.Tensor) -> bool:
-    """Whether the recording may be of physics without the step: not if less than half of c' is surely in r."""
-    residuals, total = there.residuals, float(left.square().sum())
+def has_no_step(residuals: torch.Tensor, left: torch.Tensor, where: torch.Tensor) -> bool:
+    """Whether the recording may be of physics without the step: not if less than half of c' is surely in r.
+
+    Args:
+        residuals: r, (K, R, n) [rad].
+        left: c', (K, R, n) [rad].
+        where: Samples that count, (K, R) bool.
+    """
+    total = float(left.square().sum())
     if total == 0:
         return False
-    part, variance = -float((residuals.error[0] * left).sum()) / total, 0.0
-    for r in range(residuals.where.shape[1]):
-        at = residuals.where[:, r]
+    part, variance = -float((residuals * left).sum()) / total, 0.0
+    for r in range(where.shape[1]):
+        at = where[:, r]
         for joint in range(left.shape[-1]) if bool(at.any()) else ():
-            own, error = left[None, at, r, joint].numpy(), residuals.error[0, at, r, joint].numpy()
+            own, error = left[None, at, r, joint].numpy(), residuals[at, r, joint].numpy()
             variance += float((own * filtered(own, autocovariance(error))).sum())
     return part + SURE * np.sqrt(max(variance, 0.0)) / total > 0.5

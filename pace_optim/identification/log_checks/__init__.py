@@ -1,5 +1,5 @@
 """What is wrong with a log, named before anything is searched."""
 
-from .checks import CHECKS, SIGHTS, Finding, check_log, checked
+from .checks import Finding, check_log, checked
 
-__all__ = ["CHECKS", "SIGHTS", "Finding", "check_log", "checked"]
+__all__ = ["Finding", "check_log", "checked"]

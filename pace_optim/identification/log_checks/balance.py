@@ -23,6 +23,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from pace_actuators.identified import DRIVE_FIELDS
+from pace_actuators.joint_units import JointType
 from pace_optim.problem.inverse_dynamics import LinkMotion, bounded_least_squares, frame_motion, model_of
 from pace_optim.problem.moving_base import joints_of_feet
 from pace_optim.problem.problem import Problem
@@ -56,6 +57,8 @@ class View:
 
     name: str
     joints: tuple[str, ...]
+    types: tuple[JointType, ...]
+    """Whether each joint turns or slides."""
     dt: float
     """Between samples [s]."""
     control_dt: float
@@ -162,6 +165,7 @@ def views_of(problem: Problem) -> list[View]:
         view = View(
             name=recording.name,
             joints=problem.joint_names,
+            types=problem.joint_types,
             dt=float(np.median(np.diff(recording.time))),
             control_dt=problem.control_dt,
             steps=recording.sample_steps,

@@ -11,6 +11,7 @@ import itertools
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -35,13 +36,13 @@ _WORTH = 0.6
 """Of the misfits in a coarse look: a change that leaves more is not looked at further."""
 _TWICE = 1.8
 """Smallest factor between units, or of a gear, that is named."""
-_LEAST_TRAVEL, _MOST_TRAVEL = 0.15, 7.0
-"""Of a joint in a recording that is fitted [rad]."""
-_SCALES = np.geomspace(1 / 200, 200, 27)
+_TRAVEL: Mapping[JointType, tuple[float, float]] = {"hinge": (0.15, 7.0), "slide": (0.01, 7.0)}
+"""Least and most of a joint in a recording that is fitted [rad, m]."""
+_SCALES = np.geomspace(1 / 1500, 1500, 37)
 _DIRECTIONS = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], float)
 _SHARE = 0.02
 """Part of a recording in which a limit must act to be named."""
-_COMMANDED = 0.05
+_COMMANDED: Mapping[JointType, float] = {"hinge": 0.05, "slide": 0.005}
 """Travel of a command that moves a joint whose drive is on [rad, m]."""
 _FOLLOWED = 0.02
 """Part of that travel which is no motion."""
@@ -54,7 +55,9 @@ _ABRUPT = 3.0
 _NUMERICAL = 1e-9
 """Steps that are rounding [rad]."""
 _SPIKE = 3.0
-"""Of the steps that are larger than most: the two steps of a spike."""
+"""Of the steps that are larger than most: the two steps of a spike, ..."""
+_LEAST_SPIKE: Mapping[JointType, float] = {"hinge": 1e-3, "slide": 1e-4}
+"""... and the smallest one [rad, m]."""
 _TILT = 15.0
 """Smallest turn of gravity that is named [degrees]."""
 
@@ -117,7 +120,7 @@ class Finding:
         names, pattern = in_short(list(self.limits))
         unit = units_for("N m", [types[joint] for joint in self.limits])
         stated, shown = zip(*self.limits.values(), strict=True)
-        seen = "needed" if self.check == _LIFTED.name else "seen"
+        seen = "needed" if self.check == "lifted limits" else "seen"
         rows = aligned(
             [
                 [f"joint {pattern}".strip(), *names],
@@ -165,16 +168,6 @@ class Evidence:
             (j for j, each in self.balance.items() if each.misfit > _DOUBTED),
             key=lambda j: -self.balance[j].misfit,
         )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Check:
-    """One kind of fault."""
-
-    name: str
-    changes: Callable[[Any], Iterator[Change]]
-    """The changes that are worth trying."""
-    stops: bool
 
 
 def _column(series: np.ndarray, joint: int | list[int], values: np.ndarray) -> np.ndarray:
@@ -257,32 +250,37 @@ def scaled(evidence: Evidence) -> Iterator[Change]:
             float(np.ptp(series[:, joints], axis=0).max()) for series in (view.position, view.target)
         )
         for scales, positions, targets, what in (
-            (_both_scales(min(measured, commanded)), True, True, "positions and targets"),
+            (
+                _both_scales(min(measured, commanded), {view.types[j] for j in joints}),
+                True,
+                True,
+                "positions and targets",
+            ),
             (_scales_about(measured, commanded), True, False, "the positions (dof_pos)"),
             (_scales_about(commanded, measured), False, True, "the targets (des_dof_pos)"),
         ):
             if not len(scales):
                 continue
 
-            def changed(
-                factor: float, joints: list[int] = joints, positions: bool = positions, targets: bool = targets
-            ) -> View:
-                return _scaled(view, joints, 1 / factor if positions else None, 1 / factor if targets else None)
-
+            changed = partial(_divided, view, joints, positions, targets)
             factor = _known(_least(evidence, changed, scales, joints))
             if abs(np.log(factor)) > np.log(_TWICE):
                 yield Change(
                     joints=tuple(joints),
                     view=changed(factor),
-                    text=f"{what} of {{joints}} are {factor:.3g} times those of the joint. {_cure_of(factor)}",
+                    text=f"{what} of {{joints}} are {factor:.4g} times those of the joint. {_cure_of(factor)}",
                 )
 
 
-def _both_scales(travel: float) -> np.ndarray:
-    """Factors that leave a joint's travel one that is usual."""
-    return _SCALES[
-        (travel / _SCALES > _LEAST_TRAVEL) & (travel / _SCALES < _MOST_TRAVEL) & (abs(np.log(_SCALES)) > 0.5)
-    ]
+def _divided(view: View, joints: list[int], positions: bool, targets: bool, factor: float) -> View:
+    return _scaled(view, joints, 1 / factor if positions else None, 1 / factor if targets else None)
+
+
+def _both_scales(travel: float, types: set[JointType]) -> np.ndarray:
+    """Factors that leave the travel of joints of some types one that is usual."""
+    least, most = zip(*(_TRAVEL[each] for each in types), strict=True)
+    own = travel / _SCALES
+    return _SCALES[(own > min(least)) & (own < max(most)) & (abs(np.log(_SCALES)) > 0.5)]
 
 
 def _scales_about(one: float, other: float) -> np.ndarray:
@@ -298,14 +296,17 @@ _UNITS = (
 )  # fmt: skip
 _NEAR = 0.05
 """Relative distance within which a factor is that of a unit, or a gear's whole ratio."""
+_LARGEST_GEAR = 400.0
+"""A factor beyond that of any gear is that of a unit."""
 
 
 def _known(factor: float) -> float:
     """The factor of a unit or a gear that is nearest, if one is near."""
     whole = round(factor) if factor > 1 else 1 / round(1 / factor)
-    known = [value for value, _ in _UNITS] + [float(whole)]
+    is_unit = abs(np.log(factor)) > np.log(_LARGEST_GEAR)
+    known = [value for value, _ in _UNITS] + [float(whole)] * (not is_unit)
     nearest = min(known, key=lambda value: abs(np.log(factor / value)))
-    return nearest if abs(factor / nearest - 1) < _NEAR else factor
+    return nearest if is_unit or abs(factor / nearest - 1) < _NEAR else factor
 
 
 def _cure_of(factor: float) -> str:
@@ -397,13 +398,19 @@ def _without_limits(view: View, j: int) -> View:
     return replace(view, **limits)
 
 
+def _limited(view: View, j: int, limit: float) -> View:
+    limits = view.effort_limit.copy()
+    limits[j] = limit
+    return replace(view, effort_limit=limits)
+
+
 def _limits_of(view: View, j: int) -> str:
     """The limits of a joint's drive, for a table."""
     limit, stall, fastest = view.effort_limit[j], view.saturation_effort[j], view.velocity_limit[j]
     told = [f"{limit:.3g}"] if np.isfinite(limit) else []
     if np.isfinite(stall) and np.isfinite(fastest):
         told.append(f"{stall:.3g} at stall, 0 at {fastest:.3g} rad/s")
-    return "; ".join(told) or "no limit"
+    return units_for("; ".join(told), [view.types[j]]) or "no limit"
 
 
 def _of_known_gains(evidence: Evidence) -> list[int]:
@@ -420,18 +427,14 @@ def torque_limit(evidence: Evidence) -> Iterator[Change]:
         if len(most) < 2:
             continue
 
-        def changed(limit: float, j: int = j) -> View:
-            limits = view.effort_limit.copy()
-            limits[j] = limit
-            return replace(view, effort_limit=limits)
-
+        changed = partial(_limited, view, j)
         limit = _least(evidence, changed, most, [j])
         if limit < view.effort_limit[j] and np.mean(np.abs(view.asked(j)) > limit) > _SHARE:
             yield Change(
                 joints=(j,),
                 view=changed(limit),
-                text="the torque of {joints} ends below the stated limit. State the real effort_limit in the facts "
-                "(--facts FILE, or NAME.json beside the log), or let it be sought: --unknown effort_limit.",
+                text="the torque of {joints} ends below any limit that is stated. State the real effort_limit in the "
+                "facts (--facts FILE, or NAME.json beside the log), or let it be sought: --unknown effort_limit.",
                 limit=(_limits_of(view, j), limit),
             )
 
@@ -498,14 +501,10 @@ def _of_base(view: View, evidence: Evidence) -> list[Finding]:
             text=f"the IMU is {1e3 * abs(found[1]):.2g} ms {'later' if found[1] > 0 else 'earlier'} than the encoders. "
             "It is shifted by that for the fit. Correct its time stamps.",
         )
-        result.append(replace(_finding(_LATE_IMU, change), imu_delays={view.name: found[1]}))
+        result.append(replace(_finding("IMU delay", change), imu_delays={view.name: found[1]}))
     for joints, text in stuck_contacts(view, lambda: evidence.doubted):
-        result.append(_finding(_CONTACTS, Change(joints=tuple(joints), view=view, text=text)))
+        result.append(_finding("contacts", Change(joints=tuple(joints), view=view, text=text)))
     return result
-
-
-_LATE_IMU = Check(name="IMU delay", changes=lambda _: iter(()), stops=False)
-_CONTACTS = Check(name="contacts", changes=lambda _: iter(()), stops=False)
 
 
 def _least(evidence: Evidence, changed: Callable[[float], View], values: np.ndarray, joints: list[int]) -> float:
@@ -530,7 +529,9 @@ def standstill(view: View) -> Iterator[Change]:
         np.ptp(view.target, axis=0), np.ptp(np.cumsum(view.target_vel, axis=0), axis=0) * view.control_dt
     )
     moved = np.ptp(view.smooth(view.position), axis=0)
-    still = [j for j in range(len(view.joints)) if travel[j] > _COMMANDED and moved[j] < _FOLLOWED * travel[j]]
+    still = [
+        j for j, kind in enumerate(view.types) if travel[j] > _COMMANDED[kind] and moved[j] < _FOLLOWED * travel[j]
+    ]
     dead = [j for j in still if np.ptp(view.position[:, j]) == 0.0]
     for joints, what, cure in (
         (dead, "never changes", "the encoder is dead or not logged, or the joint is blocked"),
@@ -561,7 +562,7 @@ def frozen_encoder(view: View) -> Iterator[Change]:
             (a, b)
             for a, b in runs
             if max(jerk[a], jerk[b]) > _ABRUPT * usual
-            and np.ptp(view.target[view.steps[a] : view.steps[b], j]) > _COMMANDED
+            and np.ptp(view.target[view.steps[a] : view.steps[b], j]) > _COMMANDED[view.types[j]]
         ]
         if not frozen:
             continue
@@ -582,7 +583,7 @@ def spikes(view: View) -> Iterator[Change]:
     """Single positions lie far from their neighbours."""
     for j in range(len(view.joints)):
         position = view.position[:, j]
-        found = _spikes_of(position)
+        found = _spikes_of(position, _LEAST_SPIKE[view.types[j]])
         if found.any():
             first = float(np.flatnonzero(found)[0] * view.dt)
             at = np.arange(len(position))
@@ -594,10 +595,10 @@ def spikes(view: View) -> Iterator[Change]:
             )
 
 
-def _spikes_of(position: np.ndarray) -> np.ndarray:
+def _spikes_of(position: np.ndarray, least: float) -> np.ndarray:
     """Up to three samples away from both neighbours, by steps that are large for the recording, (K,) bool."""
     step = np.diff(position)
-    least = max(_SPIKE * float(np.quantile(np.abs(step), 0.98)), 0.01 * float(np.ptp(position)), 1e-3)
+    least = max(_SPIKE * float(np.quantile(np.abs(step), 0.98)), 0.01 * float(np.ptp(position)), least)
     found = np.zeros(len(position), dtype=bool)
     for a in np.flatnonzero(np.abs(step) > least):
         for length in (1, 2, 3):
@@ -621,42 +622,45 @@ def _runs(where: np.ndarray) -> list[tuple[int, int]]:
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
-SIGHTS = (
-    Check(name="standstill", changes=standstill, stops=True),
-    Check(name="frozen encoder", changes=frozen_encoder, stops=True),
-    Check(name="spikes", changes=spikes, stops=False),
-)
+_SIGHTS: Mapping[str, Callable[[View], Iterator[Change]]] = {
+    "standstill": standstill,
+    "frozen encoder": frozen_encoder,
+    "spikes": spikes,
+}
 """What is seen in a log by itself."""
-_LIFTED = Check(name="lifted limits", changes=lifted_limits, stops=False)
-"""Named by itself: a motion that follows what is asked refutes a limit, also where something else is missing."""
-CHECKS = (
-    Check(name="IMU units", changes=imu_units, stops=True),
-    Check(name="IMU axes", changes=imu_axes, stops=True),
-    Check(name="reversed sign", changes=reversed_sign, stops=True),
-    Check(name="swapped joints", changes=swapped, stops=True),
-    Check(name="wrapped targets", changes=wrapped_targets, stops=True),
-    Check(name="clipped targets", changes=clipped_targets, stops=True),
-    Check(name="gravity", changes=turned_gravity, stops=False),
-    Check(name="torque limit", changes=torque_limit, stops=False),
-    Check(name="scale", changes=scaled, stops=True),
-)
+_CHECKS: Mapping[str, Callable[[Evidence], Iterator[Change]]] = {
+    "IMU units": imu_units,
+    "IMU axes": imu_axes,
+    "reversed sign": reversed_sign,
+    "swapped joints": swapped,
+    "wrapped targets": wrapped_targets,
+    "clipped targets": clipped_targets,
+    "gravity": turned_gravity,
+    "torque limit": torque_limit,
+    "scale": scaled,
+}
+"""Changes of a log, or of what is taken for granted, that are worth trying."""
+_GOES_ON = ("spikes", "gravity", "torque limit", "lifted limits", "IMU delay", "contacts")
+"""Checks after which a fit can be right."""
 
 
 def explained(view: View) -> list[Finding]:
     """What is wrong with a recording, change by change."""
     findings = []
-    for check in SIGHTS:
-        for change in list(check.changes(view)):
+    for check, changes in _SIGHTS.items():
+        for change in list(changes(view)):
             findings.append(_finding(check, change))
-            view = replace(view, position=change.view.position, used=view.used & change.view.used)
+            joints = list(change.joints)
+            position = _column(view.position, joints, change.view.position[:, joints])
+            view = replace(view, position=position, used=view.used & change.view.used)
     before = evidence = Evidence.of(view)
     for change in list(lifted_limits(evidence)):
         (j,) = change.joints
         after = Evidence.of(_without_limits(evidence.view, j), evidence, change.joints)
         if _gain(evidence, after, change) > 0:
-            findings.append(_finding(_LIFTED, change, evidence.balance[j].misfit, after.balance[j].misfit))
+            findings.append(_finding("lifted limits", change, evidence.balance[j].misfit, after.balance[j].misfit))
             evidence = after
-    named: list[tuple[Check, Change]] = []
+    named: list[tuple[str, Change]] = []
     for _ in range(2 * len(view.joints) + 1):
         step = _best_change(evidence)
         if step is None:
@@ -671,20 +675,20 @@ def explained(view: View) -> list[Finding]:
     return findings if view.frame is None else findings + _of_base(view, evidence)
 
 
-def _finding(check: Check, change: Change, before: float | None = None, after: float = 0.0) -> Finding:
+def _finding(check: str, change: Change, before: float | None = None, after: float = 0.0) -> Finding:
     names = tuple(change.view.joints[j] for j in sorted(change.joints))
     return Finding(
-        check=check.name, recordings=(change.view.name,), joints=names, before=before, after=after,
-        text=change.text, stops=check.stops, limits={names[0]: change.limit} if change.limit else {},
+        check=check, recordings=(change.view.name,), joints=names, before=before, after=after,
+        text=change.text, stops=check not in _GOES_ON, limits={names[0]: change.limit} if change.limit else {},
     )  # fmt: skip
 
 
-def _best_change(evidence: Evidence) -> tuple[Check, Change, Evidence] | None:
+def _best_change(evidence: Evidence) -> tuple[str, Change, Evidence] | None:
     """The change that explains most; the first after which nothing is doubted."""
-    best: tuple[float, Check, Change, Evidence] | None = None
+    best: tuple[float, str, Change, Evidence] | None = None
     coarse = evidence.coarse()
-    for check in CHECKS:
-        for change in check.changes(evidence):
+    for check, changes in _CHECKS.items():
+        for change in changes(evidence):
             if not _may_explain(coarse, change):
                 continue
             after = Evidence.of(change.view, evidence, change.joints)
@@ -724,7 +728,7 @@ def check_log(problem: Problem) -> list[Finding]:
             f"no joint moves by {1e3 * _STANDS:g} mrad or mm: a robot that stands shows no parameter. Record a motion."
         )
         still = Change(joints=tuple(range(len(views[0].joints))), view=views[0], text=text)
-        return [replace(_finding(SIGHTS[0], still), recordings=tuple(view.name for view in views))]
+        return [replace(_finding("standstill", still), recordings=tuple(view.name for view in views))]
     for view in views:
         for finding in explained(view):
             merged.setdefault((finding.check, finding.joints), []).append(finding)

@@ -10,6 +10,7 @@ import torch
 
 from pace_actuators.base_parameters import BASE_PARAMETERS
 from pace_actuators.effects import PROBED_STIFFNESS, Effect, EffectCfg, EffectParameter
+from pace_actuators.joint_units import JointType
 from pace_optim.estimate.error_bars.uncertainty import AT_BOUND
 from pace_optim.problem.parameter_space import Box
 from pace_optim.problem.problem import Problem
@@ -256,6 +257,10 @@ class JointModel:
             if joint_type not in effect.joint_types:
                 excluded |= those
         return ~excluded
+
+    def joint_type(self, joint: int) -> JointType:
+        """Whether a joint turns or slides."""
+        return "slide" if bool(self.slides[joint]) else "hinge"
 
     def at_bounds(self, x: torch.Tensor, moves: torch.Tensor | None = None) -> torch.Tensor:
         """Entries of effects that have run into a bound, (n, P) bool.

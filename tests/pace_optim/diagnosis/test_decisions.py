@@ -1,10 +1,12 @@
 """What a diagnosis decided can be decided again from its log, and every number that it decides by is in one place."""
 
 import ast
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 from decisions import read_cases, save_cases, table
 from diagnoses import errors_of
 from places import ROOT
@@ -13,6 +15,7 @@ from search_worlds import STANDS_IN, searched
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg
 from pace_optim.diagnosis.selection.decisions import Decision, as_lines, read_decisions
 from pace_optim.diagnosis.selection.rules import decide, decided
+from pace_optim.joints.fits.block_errors import BlockErrors
 
 FOLDERS = [ROOT / "pace_optim" / room for room in ("diagnosis", "joints/fits")]
 CASES = read_cases(sorted((Path(__file__).parent / "decisions").glob("*.jsonl*")))
@@ -48,6 +51,23 @@ def test_saved_cases_are_read_as_they_were(tmp_path):
     save_cases({"two": log, "none": []}, tmp_path / "saved.jsonl.gz")
     read = read_cases([tmp_path / "saved.jsonl.gz"])
     assert read["none"] == [] and as_lines(read["two"]) == as_lines(read_decisions(as_lines(log).decode()))
+
+
+def test_a_joint_with_fewer_blocks_is_kept_as_json_and_read_as_it_was():
+    """Of walks: NaN stood in the file, which is no JSON."""
+    square = torch.tensor([[4.0, 2.0], [3.0, torch.nan]], dtype=torch.float64)
+    before = BlockErrors(square=square, weight=torch.ones(2, dtype=torch.float64))
+    made = Decision.of("trim", [0, 1], before, {"trimmed": before}, {"trimmed": [1]})
+
+    def refused(name):
+        raise AssertionError(name)
+
+    text = as_lines([made]).decode()
+    json.loads(text, parse_constant=refused)
+    (read,) = read_decisions(text)
+    for own, other in ((made.before, read.before), (made.after["trimmed"], read.after["trimmed"])):
+        assert torch.equal(own.square.nan_to_num(-1.0), other.square.nan_to_num(-1.0))
+    assert read.places("trimmed") == made.places("trimmed") == [1]
 
 
 def test_a_table_says_which_rules_acted_and_what_other_numbers_would_do():

@@ -248,6 +248,32 @@ def test_the_global_random_state_is_left_alone(bench):
     assert np.array_equal(before, np.random.get_state()[1])
 
 
+def test_fewer_generations_than_a_run_has_had_begin_no_line_and_are_refused(pendulums, unbroken):
+    """The line began in a generation of the past: its winner was a candidate of another delay."""
+    trees, _ = unbroken
+    half = run(pendulums, 8, 20, trees=trees, after=lambda o: o.generation == 10 and o.stop("interrupted"))
+    assert half.line_generation == -1
+
+    def restored(generations):
+        cfg = CMAESOptimizerCfg(max_iteration=generations, epsilon=None)
+        fresh = CMAESOptimizer(pendulums.space, 8, cfg, seed=1, trees=trees)
+        fresh.restore(half.history, half.line_generation)
+        return fresh
+
+    fresh = restored(11)
+    assert fresh.best_scores == half.best_scores and torch.equal(fresh.best, half.best)
+    search(fresh, pendulums.evaluator().rollout(8))
+    assert fresh.line_generation == (10 if trees else -1) and fresh.generation == 11
+    with pytest.raises(ValueError, match="has had 10 generations, more than max_iteration 9"):
+        restored(9)
+
+
+@pytest.mark.parametrize("generations", [2, 3, 5, 9])
+def test_a_search_of_few_generations_ends_with_one_delay_too(pendulums, generations):
+    optimizer = run(pendulums, 8, generations, trees=pendulums.trees)
+    assert optimizer.line_generation == generations - 1
+
+
 # ---------------------------------------------------------------- objectives of PACE's advanced tutorial
 
 

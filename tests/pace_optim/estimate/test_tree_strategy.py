@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 import pytest
 
+from pace_optim.estimate.convergence import stop_rule
 from pace_optim.estimate.tree_strategy import TreeStrategy, into_unit_box
 
 with warnings.catch_warnings():
@@ -52,3 +53,21 @@ def test_the_search_is_to_the_last_digit_that_of_pycma_with_bounds(size, populat
         assert own.stop_reason == next((f"cma: {name}" for name in reference.stop()), None)
         if own.stop_reason:
             break
+
+
+@pytest.mark.parametrize("rule", ["plateau", "window", "gradient", "early_stopping"])
+def test_rules_on_the_best_score_begin_anew_once_the_trees_share_their_delay(rule):
+    """Each tree was compared with its best at a separate delay, and ended at once."""
+    criteria = [stop_rule(f"{rule}:generations=3")]
+    own = TreeStrategy(range(3), start=np.zeros(3), sigma=0.5, population_size=6, seed=0, criteria=criteria)
+
+    def told(best):
+        own.tell(best + np.arange(6.0), own.ask())
+        return own.stop_reason
+
+    assert [told(0.5**k) for k in range(8)] == [None] * 8
+    own.forget_best()
+    own.best_score = 1.0
+    assert [told(0.9 * 0.5**k) for k in range(8)] == [None] * 8
+    assert [bool(told(1.0)) for _ in range(8)][-1]
+    assert len(own.best_scores) == 24

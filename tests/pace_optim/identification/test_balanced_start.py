@@ -2,7 +2,18 @@
 
 import numpy as np
 import pytest
-from problems import BENCH, CALM, chirp, env_cfg, make_problem, replayed
+from problems import (
+    BENCH,
+    CALM,
+    PENDULUMS_TRUTH,
+    chirp,
+    env_cfg,
+    make_problem,
+    pendulums_cfg,
+    pendulums_target,
+    record,
+    replayed,
+)
 
 from pace_optim.identification import balanced_start as module
 from pace_optim.identification.balanced_start import balanced_start
@@ -44,3 +55,16 @@ def test_what_the_balance_puts_at_its_bound_keeps_its_start(monkeypatch):
     usual, values = (space.to_dict(space.to_physical(x)) for x in (space.start, balanced_start(problem)[0]))
     assert values["armature"][joint] == pytest.approx(0.05) and values["viscous_friction"][joint] == pytest.approx(3.0)
     assert values["friction"][joint] == usual["friction"][joint] > 0
+
+
+def test_a_joint_that_does_not_balance_at_the_best_delay_keeps_its_start(monkeypatch, tmp_path):
+    """It kept what another delay gave."""
+    cfg = pendulums_cfg(tmp_path)
+    problem = make_problem(record(pendulums_target(2.0), PENDULUMS_TRUTH, cfg=cfg), cfg=cfg)
+    parts = iter([0.4, 0.9, 0.6, 0.1])  # of two joints at two delays
+    numbers = np.array([0.05, 3.0, 0.1, 0.0, 0.0])
+    monkeypatch.setattr(module, "_solved", lambda *_: (numbers, next(parts, 2.0)))
+    space, (first, second) = problem.space, problem.joint_names
+    usual, values = (space.to_dict(space.to_physical(x)) for x in (space.start, balanced_start(problem)[0]))
+    assert values["armature"][first] == usual["armature"][first] != values["armature"][second]
+    assert values["armature"][second] == pytest.approx(0.05) and values["delay"]["all"] == pytest.approx(1.0)

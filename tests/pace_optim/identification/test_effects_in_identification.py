@@ -17,9 +17,13 @@ import pace_optim.identification.fit as fit_module
 from pace_actuators.effects import get_effect
 from pace_envs import set_physics_dt
 from pace_optim.identification.fit import fit
+from pace_optim.identification.optimization import Optimization
+from pace_optim.identification.setup import make_optimizer
 from pace_optim.joints.simulation import reference_path, twin_problem
 from pace_optim.recording import save_recording
+from pace_optim.run.folder import RunFolder
 from pace_optim.run.settings import FitSettings
+from pace_optim.terminal.processes import Processes
 from pace_optim.terminal.progress import ProgressLine
 
 
@@ -117,6 +121,24 @@ def test_a_fit_finds_which_side_of_an_elastic_shaft_the_encoder_is_on(tmp_path):
     result, _ = fit(FitSettings(task=BENCH, data=[str(data)], log_dir=str(tmp_path), **options))
     assert result.parameters["joint_elasticity.encoder_side"] == {"servo": 1.0}
     assert result.parameters["joint_elasticity.stiffness"]["servo"] == pytest.approx(600.0, rel=0.02)
+
+
+def test_a_resumed_search_has_the_structure_that_it_was_begun_with(tmp_path):
+    """It went on with that of the start: the encoder on the other side of the shaft."""
+    problem = problem_with(["joint_elasticity"])
+    asked = FitSettings(task=BENCH, data=["log.npz"], num_envs=16)
+    before, resumed = (Optimization(asked, problem, RunFolder(tmp_path), Silent()) for _ in range(2))
+    label, start = "joint_elasticity.encoder_side/servo", before.problem.space.to_physical(before.problem.space.start)
+    at = problem.space.labels.index(label)
+    other = before.problem.holding({label: 1.0 - float(start[at])})
+    before._around = other.space.to_physical(other.space.start)
+    before.optimizer = make_optimizer(other, asked, Processes(), before._around)
+    before.optimizer.ask()
+    before.optimizer._learn(np.arange(float(before.optimizer.population_size))[:, None])
+    before._write_checkpoint()
+    resumed.restore(RunFolder(tmp_path).read_checkpoint())
+    assert float(resumed.optimizer.space.lower[at]) == 1.0 - float(start[at])
+    assert torch.equal(resumed.optimizer.best, before.optimizer.best)
 
 
 TWIN_CASES = {

@@ -182,3 +182,13 @@ def test_what_cannot_be_negative_is_searched_by_magnitude():
     x = by_magnitude.to_normalised(physical)
     assert float(x[entry]) == pytest.approx(0.0, abs=1e-9)  # half way from a ten-thousandth of the bound to it
     torch.testing.assert_close(by_magnitude.to_physical(x), physical)
+
+
+@pytest.mark.parametrize("scale", ["linear", "log"])
+def test_holding_some_entries_keeps_the_start_of_the_others(scale):
+    own = replace(parameter(scale=scale), start=0.8)
+    space = ParameterSpace((own, replace(parameter("each", scale=scale), start=(0.6, 1.9)), parameter("middle")))
+    values = space.to_physical(space.start)
+    held = space.holding(["gain/b", "each/a"], values.new_tensor([0.8, 1.7, 1.2, 1.9, 1.25, 1.25]))
+    expected = values.new_tensor([0.8, 1.7, 1.2, 1.9, 1.25, 1.25])
+    torch.testing.assert_close(held.to_physical(held.start), expected)

@@ -7,8 +7,10 @@ import json
 import os
 import socket
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from places import ROOT, SUPPORT
@@ -120,6 +122,22 @@ def test_a_shared_fit_that_is_resumed_ends_as_one_that_was_not_shared(start, ben
     _texts(start(2, FIT, "--resume", run, "--max_iteration", "4"))
     result = json.loads((Path(run) / "result.json").read_text())
     assert result["generations"] == 4 and result["parameters"] == alone.parameters
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("optimizer", ["hybrid", "least_squares"])
+def test_a_shared_fit_with_descents_ends_as_one_that_was_not_shared(optimizer, start, tmp_path):
+    """The helper searched for 200 generations, the other for as many as the descents leave: both waited."""
+    made = record(chirp(0.5))
+    data = save_recording(tmp_path / "wrong.npz", replace(made, dof_pos=np.roll(made.dof_pos, 5, axis=0)))
+    common = {"task": BENCH, "data": [str(data)], "num_envs": 12}
+    alone, _ = fit(FitSettings(**common, optimizer=optimizer, log_dir=str(tmp_path / "alone")))
+    options = ["--task", BENCH, "--data", str(data), "--num_envs", "12", "--optimizer", optimizer]
+    _texts(start(2, FIT, *options, "--log_dir", str(tmp_path / "shared")))
+    (run,) = (tmp_path / "shared").glob("*/*")
+    result = json.loads((run / "result.json").read_text())
+    assert result["parameters"] == alone.parameters and result["generations"] == alone.generations
+    assert (alone.generations > 0) == (optimizer == "hybrid")
 
 
 @pytest.mark.slow

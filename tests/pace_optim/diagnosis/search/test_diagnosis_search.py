@@ -13,6 +13,7 @@ from pace_actuators.effects import get_effect
 from pace_optim.diagnosis.candidates.screening import absorbed_effects, probe_values
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.diagnosis.findings.advice import advise, rivals
+from pace_optim.diagnosis.search.one_round import _short_list
 from pace_optim.diagnosis.search.replace_effect import exchanged, replace_effects
 from pace_optim.diagnosis.search.search import add_effects
 from pace_optim.diagnosis.search.state import Branch
@@ -235,6 +236,14 @@ def test_an_effect_of_a_size_that_no_drive_has_is_no_rival_of_a_plausible_one():
     negative = replace(negative, implausible=True, mse_after=0.9 * payload.mse_after)
     assert choose([[negative, payload]]).chosen == [payload.effect] and choose([[negative, payload]]).rivals == [[]]
     assert choose([[negative]]).chosen == [negative.effect]  # a hint, as nothing else comes near
+
+
+def test_the_worst_joint_is_the_one_furthest_above_its_floor():
+    """Beside a hinge at 10 mrad, effects of a carriage at 0.1 mm were not refitted: m² are small beside rad²."""
+    cfg = replace(DEFAULT.candidates, of_robot=1, of_joint=1)
+    floor, excess = torch.tensor([1e-3, 1e-6]), torch.tensor([1e-4, 1e-8])
+    explained = {GAIN: torch.tensor([0.9e-4, 0.0]), STRIBECK: torch.tensor([0.0, 0.9e-8])}
+    assert _short_list(explained, excess, floor, cfg) == [STRIBECK]
 
 
 def test_a_rival_that_is_chosen_makes_the_one_before_its_rival_and_is_none_of_its_own():

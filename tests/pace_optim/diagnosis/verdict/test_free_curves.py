@@ -225,7 +225,7 @@ def test_beside_joints_with_a_known_effect_others_keep_their_curves(run, monkeyp
     twins = SimpleNamespace(with_physics_dt=lambda _: None, coarsest_dt=0.0025, control_dt=0.0025)
     for name, result in (
         ("fit_base", (twins, outcome.base, FLOOR)),
-        ("check_data", DataCheck(floor=floor, noise=floor, numerical=floor)),
+        ("check_data", DataCheck(floor=floor, noise=floor)),
         ("absorbed_effects", {spring: four >= 0}),
         ("pool", outcome),
         ("fit_curves", curves),

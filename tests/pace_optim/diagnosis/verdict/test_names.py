@@ -1,5 +1,6 @@
 """What an effect must show before it is named, how sizes are weighed, and how it is told."""
 
+import json
 import shutil
 import sys
 from dataclasses import replace
@@ -12,6 +13,7 @@ from diagnoses import FakeFits, errors_of, hidden_run, joint_alone, make_evidenc
 from problems import CALM
 
 from pace_actuators.effects import get_effect
+from pace_actuators.files import write_json
 from pace_optim.diagnosis import Diagnosis, DiagnosisSettings, diagnose
 from pace_optim.diagnosis.checks.data_check import DataCheck
 from pace_optim.diagnosis.checks.stated_facts import excluded_effects
@@ -206,7 +208,7 @@ def test_the_sizes_of_single_recordings_are_those_that_each_shows(run):
     assert torch.allclose(apart[:, 1], now.physical[0, columns.start + 1], atol=0.02)
 
 
-def test_halves_stand_for_recordings_where_there_are_one_or_two(run):
+def test_halves_of_two_recordings_and_quarters_of_one_stand_for_recordings(run):
     assert float(unevenness(fitted_to(run.problem, 1.0, 2.0))[0]) > 0.5
     one = fitted_to(run.problem, 1.0)
     assert float(unevenness(one).max()) < 0.1
@@ -282,7 +284,7 @@ def told_in_words(found, problem):
 def told_of(outcome, decision, shares, hints=()):
     return Findings(
         outcome=outcome,
-        data=DataCheck(floor=FLOOR, noise=FLOOR, numerical=FLOOR),
+        data=DataCheck(floor=FLOOR, noise=FLOOR),
         absorbed={},
         verdict=decision,
         explained=0.75,
@@ -378,6 +380,9 @@ def test_it_is_fitted_to_the_whole_robot_all_the_same(run, bench, monkeypatch, s
         monkeypatch.setattr(findings, name, lambda *_, made=made, **__: made)
     monkeypatch.setattr(module, "search_effects", lambda *_, **__: found)
     monkeypatch.setattr(module, "fit", fit)
+    asked = json.loads((run.folder / "settings.json").read_text())
+    asked["settings"]["instead_of"] = "first"  # as a fit by torques has it
+    write_json(run.folder / "settings.json", asked)
     line = SimpleNamespace(say=said.append, wait_for=said.append, restart=lambda: None, close=lambda: None)
     assert diagnose(DiagnosisSettings(run=run.folder), line).runs == [str(run.folder)] and not refits
     diagnosis = diagnose(DiagnosisSettings(run=run.folder, refit=True), line, seen.append)
@@ -385,6 +390,7 @@ def test_it_is_fitted_to_the_whole_robot_all_the_same(run, bench, monkeypatch, s
     broken_off = stopped == "interrupted"
     assert any(f"scripts/fit.py --resume {refit}" in text for text in said) is broken_off
     assert refits[0].effects == ["parallel_spring"]
+    assert refits[0].instead_of is None
     assert diagnosis.runs == [str(run.folder), str(refit)][: 1 if broken_off else 2]
     assert Diagnosis.load(refit).verdict == "unknown"
     assert diagnosis.verdict == "unknown" and diagnosis.added == [] and diagnosis.paying == ["parallel_spring"]

@@ -37,7 +37,7 @@ def found_on_joints(*effects):
     shares = {effect: 1.0 / len(effects) for effect, _ in effects}
     return Findings(
         outcome=outcome,
-        data=DataCheck(floor=FLOOR, noise=FLOOR, numerical=FLOOR),
+        data=DataCheck(floor=FLOOR, noise=FLOOR),
         absorbed={},
         verdict="effect",
         explained=1.0,
@@ -57,6 +57,7 @@ def fit_of(rmse, value=None, std=None, at_bound=(), effect="quadratic_friction.c
         parameters=named,
         at_bound=list(at_bound),
         joint_types=["hinge"],
+        joint_type=lambda _: "hinge",
         **own,
     )
 
@@ -125,7 +126,8 @@ def test_verdict_errors_and_sizes_are_those_of_the_whole_robot_s_fit(tmp_path):
     found = found_on_joints((QUADRATIC, [0.2]))
     told = told_again(found, fit_of(1.5e-4, 0.25, 0.01), sizes, tmp_path)
     assert told.verdict == "effect" and told.runs == ["first", str(tmp_path)]
-    assert told.sizes == [sizes[0] | {"value": 0.25, "std": 0.01}, sizes[1]]
+    own = {"value": 0.25, "std": 0.01, "unit": "N m s^2/rad^2"}
+    assert told.sizes == [sizes[0] | own, sizes[1]]
     assert told.joints["servo"]["validation_rmse_after"] == pytest.approx(1.5e-4)
     assert [step["run"] for step in told.ladder] == told.runs
     assert "the whole robot's validation error falls from 10 to 0.15 mrad" in told.evidence[-1]

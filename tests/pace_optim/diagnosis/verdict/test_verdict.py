@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from diagnoses import FITS, errors_of, joint_alone, make_diagnosis, outcome_of
+from diagnoses import FITS, errors_of, joint_alone, make_diagnosis, make_evidence, outcome_of
 from report_pages import page_of
 from run_folders import write_run
 
@@ -17,13 +17,14 @@ from pace_optim.commands.diagnose import run_and_tell
 from pace_optim.diagnosis import Diagnosis
 from pace_optim.diagnosis.findings.text import lines_of, size_lines
 from pace_optim.diagnosis.search.state import Outcome
+from pace_optim.diagnosis.verdict.names import hint
 from pace_optim.diagnosis.verdict.sizes import factor_of, sizes
 from pace_optim.diagnosis.verdict.verdict import likes
 from pace_optim.estimate.error_bars.uncertainty import sandwich
 from pace_optim.joints.fits.fitted import Fitted
 from pace_optim.joints.fits.model import JointModel
 
-GAIN = get_effect("torque_gain")
+GAIN, SPRING = get_effect("torque_gain"), get_effect("parallel_spring")
 SIZE = {
     "effect": "torque_gain",
     "parameter": "gain",
@@ -144,20 +145,39 @@ def test_sizes_and_error_bars_are_those_of_least_squares():
     assert far == size | {"std": None}
 
 
-def test_a_value_that_joints_share_has_the_error_bar_of_them_all_and_of_the_step(monkeypatch):
+def hinge_and_slide(effect, *values):
+    """A model of two joints with an effect, and its physical values."""
     robot = joint_alone()
-    base, both = JointModel.base(robot.problem), torch.tensor([True, True])
-    none = torch.zeros(0, 2, dtype=torch.bool)
+    base = JointModel.base(robot.problem)
     base = replace(
         base,
-        has=none,
+        has=torch.zeros(0, 2, dtype=torch.bool),
         lower=base.lower.repeat(2, 1),
         upper=base.upper.repeat(2, 1),
         ranges=base.ranges.repeat(2, 1),
+        slides=torch.tensor([False, True]),
         efforts=base.efforts.repeat(2),
         loops=base.loops.repeat(2),
     )
-    model, physical = base.extended(robot.truth_values.repeat(2, 1), GAIN, both, torch.ones(2, 1).double())
+    own = torch.tensor([values] * 2, dtype=torch.float64)
+    return base.extended(robot.truth_values.repeat(2, 1), effect, torch.tensor([True, True]), own)
+
+
+def test_sizes_of_a_slide_have_its_units(monkeypatch):
+    """A slide's spring had 200 N m/rad."""
+    now = Fitted.start(*hinge_and_slide(SPRING, 2.0, 0.1))
+    fits = SimpleNamespace(looked_closely=lambda _, now: now)
+    monkeypatch.setattr("pace_optim.diagnosis.verdict.sizes.standard_deviations", lambda now: torch.zeros_like(now.x))
+    monkeypatch.setattr("pace_optim.diagnosis.verdict.sizes._step_shares", lambda *_: torch.zeros_like(now.x))
+    outcome = ended(None, now)
+    found = sizes(fits, outcome, torch.ones(2), ("hip", "lift"))
+    assert [size["unit"] for size in found] == ["N m/rad", "rad", "N/m", "m"]
+    evidence = {1: make_evidence(1e-4, 1e-6, 1e-8)}
+    assert [size["unit"] for size in hint(SPRING, 1, evidence, outcome, now).sizes] == ["N/m", "m"]
+
+
+def test_a_value_that_joints_share_has_the_error_bar_of_them_all_and_of_the_step(monkeypatch):
+    model, physical = hinge_and_slide(GAIN, 1.0)
     generator = torch.Generator().manual_seed(0)
     one = torch.randn(model.size, 400, 1, 1, generator=generator).repeat(1, 1, 1, 2)
     error = 1e-4 * torch.randn(400, 1, 1, generator=generator).repeat(1, 1, 2)
@@ -165,7 +185,7 @@ def test_a_value_that_joints_share_has_the_error_bar_of_them_all_and_of_the_step
     shared = replace(alone, model=replace(model, shared=frozenset({GAIN})), jacobian=None)
 
     class Fits:
-        change = 0.0
+        change, beside = 0.0, 0.0
 
         def looked_at(self, problem, models):
             return [replace(each, jacobian=one, error=error) for each in models]
@@ -174,7 +194,7 @@ def test_a_value_that_joints_share_has_the_error_bar_of_them_all_and_of_the_step
             return replace(now, jacobian=one, error=error)
 
         def trained_errors(self, problem, now):
-            return error + self.change * one[model.columns(GAIN).start]
+            return error + self.change * one[model.columns(GAIN).start] + self.beside
 
     problem = SimpleNamespace(physics_dt=1e-3, with_physics_dt=lambda dt: None)
     stds = [
@@ -187,6 +207,10 @@ def test_a_value_that_joints_share_has_the_error_bar_of_them_all_and_of_the_step
     (with_step, _) = sizes(Fits(), ended(problem, alone), torch.ones(2), ("hip", "knee"))
     slope = float(model.box.slope(alone.x)[0, model.columns(GAIN).start])
     assert with_step["std"] == pytest.approx(np.hypot(stds[0][0], 0.01 * slope * 4 / 3), rel=1e-3)
+    # nothing of what no parameter makes up for is in the recording: this very step made it
+    monkeypatch.setattr(Fits, "beside", 0.1 * torch.randn(400, 1, 2, generator=generator))
+    (made_by_it, _) = sizes(Fits(), ended(problem, alone), torch.ones(2), ("hip", "knee"))
+    assert made_by_it["std"] == pytest.approx(stds[0][0], rel=1e-6)
 
 
 def test_the_covariance_of_white_noise_is_that_of_ordinary_least_squares():

@@ -14,12 +14,19 @@ from scipy.optimize import lsq_linear
 from pace_envs import load_env_cfg
 from pace_envs.task_source import use_task
 from pace_optim.identification.log_checks import check_log, checked
-from pace_optim.identification.log_checks.balance import View
-from pace_optim.identification.log_checks.checks import _flat_ends, swapped
+from pace_optim.identification.log_checks.balance import View, views_of
+from pace_optim.identification.log_checks.checks import (
+    Evidence,
+    _flat_ends,
+    explained,
+    frozen_encoder,
+    standstill,
+    swapped,
+)
 from pace_optim.identification.setup import load_for_fit
 from pace_optim.problem.inverse_dynamics import bounded_least_squares
 from pace_optim.problem.problem import load_problem
-from pace_optim.recording import Drive
+from pace_optim.recording import Drive, Recording, save_recording
 from pace_optim.run.settings import FitSettings
 
 STRANGERS = SHARED / "cases" / "strangers"
@@ -62,6 +69,78 @@ def test_a_frozen_encoder_is_told_with_its_time(tmp_path):
     joint = made.recording.joint_names.index(made.joints[0])
     held = np.flatnonzero(np.diff(made.recording.dof_pos[:, joint]) == 0)
     assert f"{held[0] * inputs.CONTROL_DT:.4g} to {(held[-1] + 1) * inputs.CONTROL_DT:.4g} s" in found.text
+
+
+def test_spikes_of_several_joints_are_all_taken_off(monkeypatch, tmp_path):
+    """The positions of all joints but the last stayed as they were."""
+    made = inputs.make("clean", 0)
+    clean, spiky = made.recording.dof_pos, made.recording.dof_pos.copy()
+    spiky[500] += 1.0
+    log = replace(made.recording, dof_pos=spiky)
+    (view,) = views_of(inputs.problem_of(replace(made, recording=log), tmp_path))
+    seen = []
+    monkeypatch.setattr(
+        Evidence, "of", lambda view, *_: seen.append(view) or Evidence(view=view, links=None, balance={})
+    )
+    found = explained(view)
+    assert [each.joints for each in found] == [(name,) for name in log.joint_names]
+    assert np.abs(seen[0].position - clean).max() < 0.05
+
+
+AXIS = """<mujoco><worldbody><body><joint name="axis" type="slide" axis="0 0 1"/><inertial pos="0 0 0" mass="2"
+diaginertia="1 1 1"/></body></worldbody><actuator><motor joint="axis"/></actuator></mujoco>"""
+
+
+def axis_problem(folder, travel, limit=np.inf, drive=None, unit=1.0):
+    """A carriage on a vertical slide that follows a chirp."""
+    dt, kp, kd = 0.0025, 800.0, 20.0
+    t = dt * np.arange(1600)
+    target = 0.5 * travel * np.sin(2 * np.pi * (0.3 * t + 0.4 * t**2))
+    position, speed, shown = target[0] - 2 * 9.81 / kp, 0.0, []
+    for each in target:
+        shown.append(position)
+        for _ in range(10):
+            torque = np.clip(kp * (each - position) - kd * speed, -limit, limit)
+            speed += 0.1 * dt * (torque - 2 * 9.81 - 0.2 * np.tanh(1e3 * speed) - 1.0 * speed) / 2.5
+            position += 0.1 * dt * speed
+    noise = 1e-6 * np.random.default_rng(0).standard_normal(len(t))
+    recording = Recording(
+        name="log", joint_names=("axis",), time=t, dof_pos=unit * (np.array(shown) + noise)[:, None],
+        des_dof_pos=unit * target[:, None],
+        drive=drive or Drive(stiffness=np.array([kp]), damping=np.array([kd])),
+    )  # fmt: skip
+    (folder / "axis.xml").write_text(AXIS)
+    save_recording(folder / "log.npz", recording)
+    return load_problem(use_task(str(folder / "axis.xml")), data=[folder / "log.npz"], tell=lambda _: None)
+
+
+def test_a_slide_of_a_few_centimetres_is_checked_as_a_hinge_is(tmp_path):
+    """Its travel was less than what a hinge's was taken for: a dead encoder was not seen."""
+    problem = axis_problem(tmp_path, 0.04)
+    assert check_log(problem) == []
+    (view,) = views_of(problem)
+    (dead,) = standstill(replace(view, position=np.zeros_like(view.position)))
+    assert "never changes while its command travels 0.04" in dead.text
+    held = view.position.copy()
+    held[600:800] = held[600]
+    (frozen,) = frozen_encoder(replace(view, position=held))
+    assert "is frozen from 1.5" in frozen.text
+
+
+def test_millimetres_are_named(tmp_path):
+    """No factor up to a thousand was tried."""
+    (found,) = check_log(axis_problem(tmp_path, 0.04, unit=1e3))
+    assert "1000 times those of the joint. They are in thousandths: state the unit in the column map." in found.text
+
+
+def test_limits_of_a_slide_are_told_in_its_units(tmp_path):
+    drive = Drive(
+        stiffness=np.array([800.0]), damping=np.array([20.0]),
+        saturation_effort=np.array([200.0]), velocity_limit=np.array([2.0]),
+    )  # fmt: skip
+    problem = checked(axis_problem(tmp_path, 0.04, limit=24.0, drive=drive), trust=True)
+    (warning,) = (each for each in problem.contradictions if "ends below" in each)
+    assert "stated [N]" in warning and "200 at stall, 0 at 2 m/s" in warning and "rad" not in warning
 
 
 def test_a_faulty_log_is_refused_before_the_search_unless_it_is_trusted(tmp_path):

@@ -12,7 +12,7 @@ from problems import CALM, DT
 
 from pace_actuators.effects import get_effect, probe_points
 from pace_optim.diagnosis.candidates.multistart import multistart
-from pace_optim.diagnosis.checks.data_check import check_data, encoder_steps, unstamped
+from pace_optim.diagnosis.checks.data_check import check_data, encoder_steps, noise_floors, unstamped
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT
 from pace_optim.joints.fits import base_fit
 from pace_optim.joints.fits.base_fit import fit_base
@@ -436,4 +436,4 @@ def test_the_last_digit_of_a_file_is_no_step_of_an_encoder(step, said):
     noisy = np.sin(3 * time) + 1e-4 * np.random.default_rng(0).normal(size=len(time))
     position = (np.round(noisy / step) * step)[:, None]
     one = Recording(name="r", joint_names=("j",), time=time, dof_pos=position, des_dof_pos=position, notes=())
-    assert bool(encoder_steps([one], ["j"])) == said
+    assert bool(encoder_steps(noise_floors([one]), ["j"])) == said

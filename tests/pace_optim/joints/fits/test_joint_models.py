@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from diagnoses import FakeFits, joint_alone
+from diagnoses import FakeFits, errors_of, joint_alone
 
 from pace_actuators.effects import get_effect, probe_points
 from pace_optim.diagnosis.candidates.screening import Probe
@@ -39,17 +39,7 @@ def test_joints_without_an_effect_do_not_fit_it(bench):
 
 
 def test_an_effect_spreads_to_more_joints_and_keeps_the_values_of_the_others(bench):
-    one = JointModel.base(bench.problem)
-    none = torch.zeros(0, 2, dtype=torch.bool)
-    base = replace(
-        one,
-        has=none,
-        lower=one.lower.repeat(2, 1),
-        upper=one.upper.repeat(2, 1),
-        ranges=one.ranges.repeat(2, 1),
-        efforts=one.efforts.repeat(2),
-        loops=one.loops.repeat(2),
-    )
+    base = two_of(JointModel.base(bench.problem))
     values = torch.tensor([[1.0, 0.1], [2.0, 0.3]], dtype=torch.float64)
     model, physical = base.extended(base.lower, STRIBECK, torch.tensor([True, False]), values)
     model, physical = model.extended(physical, STRIBECK, torch.tensor([False, True]), values + 1)
@@ -57,18 +47,38 @@ def test_an_effect_spreads_to_more_joints_and_keeps_the_values_of_the_others(ben
     assert physical[:, model.columns(STRIBECK)].tolist() == [[1.0, 0.1], [3.0, 1.3]]
 
 
+def two_of(base, **changes):
+    """The base model of a joint, twice."""
+    many = {name: getattr(base, name).repeat(2, 1) for name in ("lower", "upper", "ranges")}
+    each = {name: getattr(base, name).repeat(2) for name in ("slides", "efforts", "loops")}
+    return replace(base, has=torch.zeros(0, 2, dtype=torch.bool), **many | each | changes)
+
+
+def test_a_slide_shares_no_value_with_a_hinge_and_is_not_hidden_by_its_error(bench):
+    """A carriage at 1 µm beside a hinge at 1 mrad: it went to 10 µm."""
+    model, both = two_of(JointModel.base(bench.problem)), torch.tensor([True, True])
+    values = torch.tensor([[1.0, 0.10], [1.2, 0.12]], dtype=torch.float64)
+    model, physical = model.extended(bench.truth_values.repeat(2, 1), STRIBECK, both, values)
+    same = torch.randn(model.size, 40, 3, 1, generator=torch.Generator().manual_seed(0)).repeat(1, 1, 1, 2)
+
+    def pooled(slides, rmse, after):
+        now = Fitted.start(replace(model, slides=torch.tensor(slides)), physical)
+        now = replace(now, jacobian=same * torch.tensor(rmse))
+        outcome = Outcome(
+            problem=None, base=Fitted.start(two_of(JointModel.base(bench.problem)), bench.truth_values.repeat(2, 1)),
+            base_errors=errors_of(*rmse), final=now, final_errors=errors_of(*rmse),
+        )  # fmt: skip
+        final = pool(FakeFits(lambda *_: errors_of(*after)), outcome).final
+        return final.model.to_physical(final.x)[:, model.columns(STRIBECK)] if final.model.shared else None
+
+    assert pooled([False, False], [1e-3, 1e-6], [1e-3, 1e-5]) is None
+    assert pooled([False, True], [1e-3, 1e-3], [1e-3, 1e-3]) is None
+    shared = pooled([False, False], [1e-3, 1e-6], [1e-3, 1e-6])  # both know it as well beside their errors
+    assert shared[0].tolist() == shared[1].tolist() == pytest.approx([1.1, 0.1 * 1.2**0.5], rel=0.02)
+
+
 def test_one_value_is_shared_where_that_explains_as_much(bench):
-    base = JointModel.base(bench.problem)
-    none = torch.zeros(0, 2, dtype=torch.bool)
-    model = replace(
-        base,
-        has=none,
-        lower=base.lower.repeat(2, 1),
-        upper=base.upper.repeat(2, 1),
-        ranges=base.ranges.repeat(2, 1),
-        efforts=base.efforts.repeat(2),
-        loops=base.loops.repeat(2),
-    )
+    model = two_of(JointModel.base(bench.problem))
     both = torch.tensor([True, True])
     found = torch.tensor([[1.0, 0.10], [1.2, 0.12]], dtype=torch.float64)
     plain = Fitted.start(model, bench.truth_values.repeat(2, 1))

@@ -12,6 +12,8 @@ import torch
 from bench_recordings import CONTROL_DT, Bench, chirp, record
 
 from pace_optim.estimate.error_bars.uncertainty import torque_noise
+from pace_optim.identification import conclude
+from pace_optim.identification import fit as fit_module
 from pace_optim.identification.fit import fit, fit_with_torques, resume
 from pace_optim.identification.optimization import Optimization
 from pace_optim.problem.evaluator import Residuals
@@ -91,6 +93,46 @@ def test_an_interrupted_fit_with_torques_resumes_to_the_same_result(tmp_path, mo
     assert half.stop_reasons == ["interrupted"]
     same = ("parameters", "std", "rmse", "torque_noise", "torque_rmse", "stop_reasons", "simulated_steps", "warnings")
     assert [getattr(resumed, name) for name in same] == [getattr(whole, name) for name in same]
+
+
+@pytest.fixture
+def short(tmp_path):
+    """A log whose positions end above the noise."""
+    bench = Bench(stated={"stiffness": 20.0, "damping": 0.5})
+    log = record(tmp_path / "log.csv", bench, position=chirp(1.0), sensor=sensed)
+    return settings(log, tmp_path / "runs", unknown=GAINS, physics_dt=CONTROL_DT)
+
+
+def test_a_fit_that_is_interrupted_in_its_checks_is_not_followed_by_one_with_torques(short, monkeypatch):
+    """Ctrl-C began a second fit; the first one's --resume then counted it as ended."""
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(conclude, "change_without_step", interrupted)
+        first, folder = fit_with_torques(short)
+    assert first.stop_reasons[-1] == "checks interrupted" and len(list(folder.parent.iterdir())) == 1
+    monkeypatch.setattr(fit_module, "_by_torques", lambda first, *_: (first, "goes on"))
+    resumed, goes_on = resume(folder)
+    assert goes_on == "goes on" and not resumed.is_interrupted
+
+
+def test_the_second_fit_with_torques_follows_a_resumed_first_one(short, tmp_path, monkeypatch):
+    first, folder = fit(short)
+    replace(first, contested=["stiffness"]).save(folder / "result.json")
+    beside, path = fit(replace(short, residual=BOTH, instead_of=str(folder)))
+    replace(beside, stop_reasons=["interrupted"]).save(path / "result.json")
+    begun = []
+
+    def begins(asked, *_, **__):
+        begun.append(asked)
+        return first, tmp_path
+
+    monkeypatch.setattr(fit_module, "fit", begins)
+    monkeypatch.setattr(fit_module, "_is_better", lambda result, *_: result is first)
+    assert resume(path) == (first, tmp_path)
+    assert [(asked.residual, asked.instead_of) for asked in begun] == [([], str(folder))]
 
 
 def test_filtered_torques_are_not_followed_by_themselves(tmp_path):
