@@ -243,7 +243,7 @@ def test_the_ranking_begins_with_what_was_added_and_names_its_rivals():
 
 
 def test_what_stays_unexplained_may_decide_between_effects():
-    """Beside others as large, another delay (0.92 mrad) lost to a drive's bandwidth (0.78 mrad), and only that was named."""
+    """Beside others as large, a delay (0.92 mrad) lost to a bandwidth (0.78 mrad), and only that was named."""
     trials = [make_trial(STRIBECK, 0, 7.8e-4), make_trial(QUADRATIC, 0, 9.2e-4), make_trial(GAIN, 0, 9.9e-4)]
     this = Round(trials=[trials], chosen=[STRIBECK], rivals=[[]])
     assert this.with_doubtful(torch.tensor([7.8e-4**2 - 1e-4**2])).rivals == [[QUADRATIC]]
