@@ -194,6 +194,32 @@ def test_a_trajectory_of_several_points_is_followed(tmp_path):
     assert np.allclose(recording.des_dof_pos, line, atol=1e-6) and len(recording.des_time) > len(COMMANDS)
 
 
+def test_a_trajectory_ends_where_the_next_message_replaces_it(tmp_path):
+    kind, second = "trajectory_msgs/msg/JointTrajectory", 10**9
+    with Bag(tmp_path / "leg") as bag:
+        for k, ns in enumerate(STAMPS):
+            bag.state("/joint_states", NOON + ns, JOINTS, POS[k])
+        for begin, targets in ((0.0, (0.0, 1.0)), (0.5013, (0.5, 0.0)), (0.9, (0.1, 0.3))):
+            points = [bag.point([x, -x], after=at) for x, at in zip(targets, (0, second), strict=True)]
+            message = bag.type(kind)(header=bag.header(0), joint_names=list(JOINTS), points=points)
+            bag.write("/leg/joint_trajectory", kind, NOON + int(begin * second), message)
+    (recording,) = load_recordings(tmp_path / "leg", ROBOT)
+    at = recording.des_time
+    first, then, last = at, 0.5 - 0.5 * (at - 0.5013), 0.1 + 0.2 * (at - 0.9)
+    expected = np.where(at < 0.5013 - 1e-9, first, np.where(at < 0.9 - 1e-9, then, last))
+    assert np.allclose(recording.des_dof_pos, np.stack([expected, -expected], axis=1), atol=1e-9)
+
+
+def test_the_last_point_of_a_trajectory_is_commanded_whatever_its_span():
+    def point(nanosec, at):
+        time_from_start = SimpleNamespace(sec=0, nanosec=nanosec)
+        return SimpleNamespace(positions=[at], velocities=[], effort=[], time_from_start=time_from_start)
+
+    message = SimpleNamespace(joint_names=["hip"], points=[point(0, 0.0), point(7_000_000, 0.7)])
+    rows = [(at, float(values[0])) for at, _, values in rows_of(message, "/plan")]
+    assert rows == [(0, 0.0), (5_000_000, pytest.approx(0.5)), (7_000_000, 0.7)]
+
+
 def test_torque_in_and_motion_out_is_a_recording(tmp_path):
     with Bag(tmp_path / "leg") as bag:
         for k, ns in enumerate(STAMPS):
