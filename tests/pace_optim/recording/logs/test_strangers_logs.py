@@ -14,6 +14,7 @@ from pace_optim.recording.data import notes_by_kind
 from pace_optim.recording.dataset import start_speed
 from pace_optim.recording.gaps import split_at_gaps
 from pace_optim.recording.logs import ColumnMap, Robot, read_map, with_rate
+from pace_optim.recording.logs.words import meaning
 from pace_optim.recording.time_base import set_back, unrounded
 
 TIME = np.arange(800) / 200
@@ -197,6 +198,58 @@ def test_a_torque_tells_the_unit_by_the_gain(tmp_path):
         replace(WHEEL, stiffness=np.array([40.0])),
     )
     assert np.ptp(degrees.recording.dof_pos) == pytest.approx(np.ptp(20 * MOTION) * np.pi / 180, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [
+        ("vel [mrad/s]", "mrad/s"),
+        ("vel_mrad_s", "mrad/s"),
+        ("vel [mdeg/s]", "mdeg/s"),
+        ("speed_deg_per_s", "deg/s"),
+        ("kneeVelRad/s", "rad/s"),
+        ("pos [mdeg]", "mdeg"),
+        ("tau [Ncm]", "N cm"),
+        ("tau_nmm", "N mm"),
+        ("tau [kN·m]", "kN m"),
+        ("tau [N-m]", "N m"),
+        ("tau (kg.cm)", "kgf cm"),
+        ("force [kN]", "kN"),
+    ],
+)
+def test_a_prefix_of_a_unit_is_part_of_it(name, unit):
+    said = meaning(f"knee_{name}" if "knee" not in name else name)
+    assert (said.unit, said.unknown_unit) == (unit, "") and said.joint == ("knee",)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"), [("torque_j [lbf in]", "lbf in"), ("temp_j [F]", "F"), ("dq_j [rad/s^2]", "rad/s^2")]
+)
+def test_a_series_in_a_unit_that_is_not_known_is_left_out_with_a_note(tmp_path, name, unit):
+    found = read(table(tmp_path / "log.csv", time=TIME, q_j=MOTION, des_j=TARGET, **{name: 10 * TARGET}), Robot())
+    one = found.recording
+    assert one.joint_names == ("j",) and one.dof_effort is None and one.temperature is None and one.dof_vel is None
+    assert any(f"{name}: the unit is not known" in line for line in found.lines)
+
+
+def test_positions_in_an_unknown_unit_are_not_taken_for_radians(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = table(tmp_path / "log.csv", **{"time": TIME, "q_j [0.01 deg]": MOTION, "des_j [0.01 deg]": TARGET})
+    with pytest.raises(ValueError, match=r"q_j \[0.01 deg\], des_j \[0.01 deg\]: the unit is not known"):
+        read(path, Robot())
+
+
+def test_brackets_that_hold_a_joint_hold_no_unit():
+    for name, joint in (("pos[hip]", ("hip",)), ("q[0]", ("0",)), ("pos (left knee)", ("left", "knee"))):
+        assert meaning(name).joint == joint and not meaning(name).unknown_unit
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-3, 180 / np.pi])
+def test_a_speed_that_contradicts_its_position_is_left_out(tmp_path, scale):
+    speed = scale * 2.4 * np.cos(3 * TIME)
+    found = read(table(tmp_path / "log.csv", time=TIME, q_rad=MOTION, dq_rad_s=speed, des_rad=TARGET), WHEEL)
+    assert (found.recording.dof_vel is None) == (scale != 1.0)
+    assert any("so one of the two units is wrong" in line for line in found.lines) == (scale != 1.0)
 
 
 @pytest.mark.parametrize("name", ["Present_Load", "load_percent", "torque_pct", "effort_permille"])
