@@ -95,22 +95,22 @@ _NOT_OF_DRIVES = {"ambient", "room", "air", "cpu", "gpu", "board", "mcu", "ntc",
 """Words of temperatures and voltages of other things than drives."""
 _GENERIC = {"joint", "joints", "j", "motor", "motors", "dof", "actuator", "servo", "axis", "drive", "link", "data"}
 _SIDES = {"l": "left", "r": "right"}
-_PER_S = r"[ _]?(/|per)[ _]?s(ec(onds?)?)?"
+PER_S = r"[ _]?(/|per)[ _]?s(ec(onds?)?)?"
 _DOT = r"[ _.·⋅*-]?"
 _UNIT_PATTERNS: tuple[tuple[str, str, str], ...] = (
     (r"°c\b|\bdeg(rees?)?[ _]?c(elsius)?\b|\bcelsius\b|[\[(]c[\])]", TEMPERATURE, "°C"),
     (r"\bmv\b|millivolts?", VOLTAGE, "mV"),
     (r"[\[(]v[\])]", VOLTAGE, "V"),
-    (rf"(?<![a-z])mdeg{_PER_S}|(?<![a-z])mdeg_s\b", VELOCITY, "mdeg/s"),
-    (rf"(?<![a-z])cdeg{_PER_S}|(?<![a-z])cdeg_s\b", VELOCITY, "cdeg/s"),
-    (rf"(?<![a-z])mrad{_PER_S}|(?<![a-z])mrad_s\b", VELOCITY, "mrad/s"),
-    (rf"(?<![mcd])deg(rees?)?{_PER_S}|(?<![mcd])deg_s\b|dps\b|(?<!m)°/s(ec)?", VELOCITY, "deg/s"),
-    (rf"(?<![mcg])rad(ians?)?{_PER_S}|(?<![mcg])rad_s\b", VELOCITY, "rad/s"),
+    (rf"(?<![a-z])mdeg{PER_S}|(?<![a-z])mdeg_s\b", VELOCITY, "mdeg/s"),
+    (rf"(?<![a-z])cdeg{PER_S}|(?<![a-z])cdeg_s\b", VELOCITY, "cdeg/s"),
+    (rf"(?<![a-z])mrad{PER_S}|(?<![a-z])mrad_s\b", VELOCITY, "mrad/s"),
+    (rf"(?<![mcd])deg(rees?)?{PER_S}|(?<![mcd])deg_s\b|dps\b|(?<!m)°/s(ec)?", VELOCITY, "deg/s"),
+    (rf"(?<![mcg])rad(ians?)?{PER_S}|(?<![mcg])rad_s\b", VELOCITY, "rad/s"),
     (r"\brpm\b", VELOCITY, "rpm"),
-    (rf"(rev|turns?){_PER_S}|rps\b", VELOCITY, "turn/s"),
-    (rf"\bmm{_PER_S}\b|mm_s\b", VELOCITY, "mm/s"),
-    (rf"\bcm{_PER_S}\b|cm_s\b", VELOCITY, "cm/s"),
-    (rf"\bm{_PER_S}\b|[ _]m_s\b", VELOCITY, "m/s"),
+    (rf"(rev|turns?){PER_S}|rps\b", VELOCITY, "turn/s"),
+    (rf"\bmm{PER_S}\b|mm_s\b", VELOCITY, "mm/s"),
+    (rf"\bcm{PER_S}\b|cm_s\b", VELOCITY, "cm/s"),
+    (rf"\bm{PER_S}\b|[ _]m_s\b", VELOCITY, "m/s"),
     (r"‰|\bper[ _]?mille?\b", EFFORT, "permille"),
     (r"%|\bpercent\b|\bpct\b", EFFORT, "%"),
     (rf"\bmn{_DOT}m\b", EFFORT, "mN m"),
