@@ -101,7 +101,7 @@ def read_logs(
     driven = env.scene["robot"].driven
 
     paths = [paired_files([str(path) for path in group]) for group in groups]
-    reader = LogReader([path for group in paths for path in group], chosen, facts)
+    reader = LogReader([path for group in paths for path in group], chosen, facts, strict)
 
     def read(path: str) -> list[Recording]:
         try:

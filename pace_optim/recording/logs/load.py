@@ -6,7 +6,7 @@ import csv
 import os
 import shlex
 import zipfile
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -53,7 +53,11 @@ class LogReader:
     """Reads the files of one command: logs with the same columns have the same units, and are described once."""
 
     def __init__(
-        self, paths: Sequence[str], columns: ColumnMap | None = None, facts: str | os.PathLike[str] | None = None
+        self,
+        paths: Sequence[str],
+        columns: ColumnMap | None = None,
+        facts: str | os.PathLike[str] | None = None,
+        strict: bool = False,
     ):
         """Args:
         paths: All files and folders. One is a recording (.csv, .npz, .pt), a rosbag2 (.mcap, .db3, or its folder), a
@@ -61,8 +65,11 @@ class LogReader:
             by `+`.
         columns: Which column is what; without it, it is guessed.
         facts: JSON file of what is true of all recordings, where they do not state it.
+        strict: Whether an episode that cannot be used refuses its log, instead of being set aside.
         """
         self._columns = columns
+        self._strict = strict
+        self._set_aside: dict[str, list[str]] = {}
         self._facts, note = ({}, "") if facts is None else read_facts(Path(facts), known=SHARED_FACTS)
         self._note = note
         self._logs: dict[str, list[Log]] = {}
@@ -84,12 +91,26 @@ class LogReader:
         """The recordings of a log, one or one per episode, and which column was taken for what."""
         columns = self._columns
         self._readings.pop(str(Path(path)), None)
+        found: list[tuple[Recording, ColumnMap]] = []
+        faults: dict[str, ValueError] = {}
         try:
-            return [self._read(Path(path), log, robot) for log in self._logs_of(path)]
+            for log in self._logs_of(path):
+                try:
+                    found.append(self._read(Path(path), log, robot))
+                except ValueError as error:
+                    if self._strict:
+                        raise
+                    faults[log.name] = error
+            if faults and not found:
+                raise next(iter(faults.values()))
         except ValueError as error:
             if columns is None or columns.source in str(error):
                 raise
             raise ValueError(f"{error} ({Path(path).name} was read by {columns.source}.)") from None
+        self._set_aside[path] = [
+            f"warning: {name} is set aside: {' '.join(str(error).split())} [W20]" for name, error in faults.items()
+        ]
+        return found
 
     def lines(self) -> list[str]:
         """How the logs were read so far, those that were read alike together."""
@@ -101,7 +122,8 @@ class LogReader:
             else:
                 group.append(reading)
         of_facts = [f"note: {self._note}"] if self._note else []
-        return [*(line for group in alike for line in _lines(group)), *of_facts]
+        of_readings = [line for group in alike for line in _lines(group)]
+        return [*of_readings, *of_facts, *(line for lines in self._set_aside.values() for line in lines)]
 
     def _logs_of(self, path: str) -> list[Log]:
         if path not in self._logs:

@@ -14,6 +14,7 @@ import numpy as np
 from pace_actuators.files import parsed_json
 from pace_actuators.memory import check_memory
 from pace_actuators.text import listed
+from pace_optim.recording.checks import MIN_SAMPLES
 from pace_optim.recording.text_table import column_of, read_rows
 from pace_optim.recording.time_base import seconds_of, set_back, unix_unit, unrounded
 from pace_optim.terminal.arrays import read_arrays
@@ -232,7 +233,12 @@ def _logs(
     parts = [slice(a, b) for a, b in zip([0, *back], [*back, len(time)], strict=True)]
     if len(back):
         jumps = [f"by {time[k - 1] - time[k]:.4g} s after row {k} ({time[k - 1] - time[0]:.4g} s)" for k in back]
-        notes.append(f"The clock goes back {listed(jumps, 4)}: read as {len(parts)} recordings.")
+        short = [rows for rows in parts if rows.stop - rows.start < MIN_SAMPLES]
+        parts = [rows for rows in parts if rows not in short] or parts
+        left = f" Parts of fewer than {MIN_SAMPLES} rows are left out." if 0 < len(short) <= len(back) else ""
+        notes.append(
+            f"The clock goes back {listed(jumps, 4)}: read as {len(parts)} recording{'s' * (len(parts) > 1)}.{left}"
+        )
     logs = []
     for number, rows in enumerate(parts, start=1):
         stamps, rounding = time[rows], ""

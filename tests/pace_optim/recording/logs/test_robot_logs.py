@@ -15,7 +15,7 @@ from recordings import says
 
 from pace_optim.commands import import_log
 from pace_optim.recording import load_recording, save_recording
-from pace_optim.recording.logs import Robot, paired_files, read_map, tables, write_map
+from pace_optim.recording.logs import LogReader, Robot, paired_files, read_map, tables, write_map
 from pace_optim.recording.logs.rosbag import rows_of
 from pace_optim.recording.logs.words import meaning
 from pace_optim.terminal.cli import run_cli
@@ -403,6 +403,22 @@ dof_effort = {from = "i1", unit = "mA", factor = 0.5, gear_ratio = 9.0, sign = -
 dof_pos = {from = "m2"}
 des_dof_pos = "c2"
 """
+
+
+def test_a_bad_episode_of_a_dataset_is_set_aside(tmp_path):
+    (tmp_path / "set/meta").mkdir(parents=True)
+    (tmp_path / "set/data").mkdir()
+    (tmp_path / "set/meta/info.json").write_text(json.dumps({"fps": 250}))
+    for i, count in enumerate((5, COUNT)):
+        columns = {"hip_pos": POS[:count, 0], "hip_cmd": HELD[:count, 0], "timestamp": np.arange(count) / 250}
+        columns["episode_index"] = np.full(count, i)
+        parquet.write_table(pa.table(columns), tmp_path / f"set/data/{i}.parquet")
+    reader = LogReader([str(tmp_path / "set")])
+    (recording,) = reader.recordings(str(tmp_path / "set"), Robot())
+    assert recording.name == "set episode 1"
+    assert "warning: set episode 0 is set aside" in reader.lines()[-1] and "[W20]" in reader.lines()[-1]
+    with pytest.raises(ValueError, match="found 5 samples"):
+        LogReader([], strict=True).recordings(str(tmp_path / "set"), Robot())
 
 
 def test_a_map_gives_units_signs_offsets_gear_ratios_currents_and_facts(tmp_path):

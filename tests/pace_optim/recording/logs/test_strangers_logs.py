@@ -291,6 +291,13 @@ def test_a_log_whose_clock_was_set_back_is_two_recordings(tmp_path):
         load_recording(tmp_path / "own.npz")
 
 
+def test_a_clock_that_is_set_back_in_its_first_rows_costs_these_rows_alone(tmp_path):
+    time = np.concatenate([5.0 + TIME[:10], TIME[10:]])
+    found = read(table(tmp_path / "back.csv", time=time, q_j=MOTION, des_j=TARGET), Robot())
+    assert found.recording.num_samples == len(TIME) - 10 and found.recording.name == "back"
+    assert any("Parts of fewer than 20 rows are left out" in line for line in found.lines)
+
+
 @pytest.mark.parametrize("gap", [0.3, 0.05])
 def test_a_gap_splits_and_a_clock_that_jumps_is_told_from_lost_samples(gap):
     fine = np.arange(1600) / 400
