@@ -15,7 +15,8 @@ from pace_envs.motor_coordinates import DrivenJoints
 from .checks import MIN_SAMPLES, refuse_uncommanded
 from .commands import GRID_COMMANDS, command_interval, commands_on_grid, timing_note
 from .data import Drive, Recording
-from .keys import COMMAND_SERIES, CONDITIONS, FEET_SERIES, JOINT_SERIES, SAMPLED_SERIES, did_you_mean
+from .gaps import from_first_command
+from .keys import COMMAND_SERIES, CONDITIONS, FEET_SERIES, JOINT_SERIES, did_you_mean
 from .time_base import (
     TimeBase,
     fit_time_base,
@@ -76,7 +77,7 @@ def conform_recording(
     if recording.command is not None:
         _check_conformed(recording, control_dt)
         return recording
-    recording = _from_first_command(recording)
+    recording = from_first_command(recording)
     origin = recording.start_stamp
     # what a torque says of its drive is read from even samples
     base = fit_time_base(recording.time, control_dt, recording.label, may_place=recording.dof_effort is None)
@@ -122,23 +123,6 @@ def _check_conformed(recording: Recording, control_dt: float) -> None:
             f"{recording.label}: is already on a control step of {recording.control_dt:g} s; expected a recording as "
             f"loaded, or one on {control_dt:g} s. Conform the loaded recording."
         )
-
-
-def _from_first_command(recording: Recording) -> Recording:
-    """The recording from where it is known what is commanded."""
-    first = recording.time[0] if recording.des_time is None else recording.des_time[0]
-    before = int(np.searchsorted(recording.time, first))
-    if not before:
-        return recording
-    if recording.num_samples - before < MIN_SAMPLES:
-        raise ValueError(
-            f"{recording.label}: {before} of {recording.num_samples} samples come before the first command, so too "
-            "few are left. Record the commands from the beginning on."
-        )
-    cut = {key: value[before:] for key in ("time", *SAMPLED_SERIES)
-           if (value := getattr(recording, key)) is not None}  # fmt: skip
-    note = f"The first {recording.time[before] - recording.time[0]:.4g} s were left out: no command is known there."
-    return replace(recording, **cut, notes=(*recording.notes, note))
 
 
 def _kept(recording: Recording, base: TimeBase) -> dict[str, Any]:

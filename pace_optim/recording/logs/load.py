@@ -84,7 +84,7 @@ class LogReader:
     def recordings(self, path: str, robot: Robot) -> list[Recording]:
         """The recordings of a file or folder."""
         if not is_log(Path(path), self._columns):
-            return [load_recording(path, self._columns.rate if self._columns else 0.0, self._facts)]
+            return [load_recording(path, self._columns.rate if self._columns else 0.0, self._facts, robot.joint_names)]
         return [recording for recording, _ in self.understood(path, robot)]
 
     def understood(self, path: str, robot: Robot) -> list[tuple[Recording, ColumnMap]]:

@@ -320,6 +320,21 @@ def test_a_gap_in_which_nothing_happens_or_that_cubics_bridge_does_not_split():
     assert split_at_gaps(whole) == [whole]
 
 
+def test_a_gap_before_the_first_command_is_left_out_with_what_comes_before():
+    time = TIME + np.where(np.arange(len(TIME)) >= 100, 0.2, 0.0)
+    late = replace(recording(time, MOTION, TARGET), des_time=time[150:], des_dof_pos=TARGET[150:, None])
+    (whole,) = split_at_gaps(late)
+    assert whole.num_samples == len(TIME) - 150 and any("no command is known" in note for note in whole.notes)
+
+
+def test_a_gap_of_a_standstill_splits_where_it_is_too_long_to_bridge():
+    still = np.zeros_like(TIME)
+    still[:300], still[500:] = np.sin(TIME[:300] - TIME[300]), np.sin(TIME[500:] - TIME[500])
+    time = TIME + np.where(np.arange(len(TIME)) >= 400, 0.7, 0.0)
+    parts = split_at_gaps(recording(time, still, still))
+    assert [part.num_samples for part in parts] == [400, 400] and "no samples for 0.705 s" in parts[0].notes[0]
+
+
 @pytest.mark.parametrize("noise", [1e-5, 1e-4, 5e-4])
 def test_a_recording_in_motion_begins_with_the_slope_of_its_positions(noise):
     fine = np.arange(1600) / 400
