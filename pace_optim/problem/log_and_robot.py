@@ -13,10 +13,9 @@ import torch
 from numpy.typing import ArrayLike
 
 from pace_actuators.base_parameters import CARRIED
-from pace_actuators.joint_units import JointType, units_for
+from pace_actuators.joint_units import SLIDE_LENGTH, JointType, units_for
 from pace_actuators.text import listed
 from pace_envs import ManagerBasedEnv, ManagerBasedRLEnv
-from pace_envs.from_model import defaults
 from pace_envs.from_model.scaling import OF_BOUNDS, largest_parameters
 from pace_envs.tasks.pace import PaceSim2realEnvCfg
 from pace_envs.tasks.pace.pace_cfg import PaceCfg
@@ -65,7 +64,7 @@ def widen_bounds(sim2real: PaceCfg, env: ManagerBasedRLEnv, recordings: Sequence
 def _scales(env: ManagerBasedRLEnv, sim2real: PaceCfg, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     """Least and most that a recording says of each drive's largest torque, (n,) each [N m]; 0 and infinity: nothing."""
     drive, configured = recording.drive, of_joints(env, "effort_limit")
-    length = np.where(np.isin(sim2real.joint_order, sim2real.slide_joints), defaults.SLIDE_LENGTH, 1.0)
+    length = np.where(np.isin(sim2real.joint_order, sim2real.slide_joints), SLIDE_LENGTH, 1.0)
     if drive.stiffness is None and drive.damping is None:
         asked, most = np.zeros(len(length)), np.full(len(length), np.inf)
     else:

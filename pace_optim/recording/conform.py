@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from pace_actuators.joint_units import JointType, all_hinges, units_for
+from pace_actuators.joint_units import JointType, all_hinges, radians, units_for
 from pace_actuators.text import listed
 from pace_envs.motor_coordinates import DrivenJoints
 
@@ -58,7 +58,8 @@ def conform_recording(
         joint_order: The robot's joints, in the order wanted.
         control_dt: Control step of the simulation [s].
         joint_pos_limits: Lower and upper limit per joint of `joint_order`, (n, 2) [rad]; infinite where none.
-        limit_margin: How far a position may lie beyond its limit [rad] (encoder bias, soft stops).
+        limit_margin: How far a position may lie beyond its limit [rad] (encoder bias, soft stops); of a slide, a tenth
+            of it [m].
         joint_types: Whether each joint of `joint_order` turns or slides; none: all turn.
         load_bodies: Bodies that `added_mass` may name.
         accepts_load: Whether the robot has the test bench's load (load_mass, load_length, arm_mass).
@@ -342,6 +343,7 @@ def _check_wraps(recording: Recording, turns: np.ndarray) -> None:
 
 def _check_limits(recording: Recording, limits: np.ndarray, margin: float, types: Sequence[JointType]) -> list[str]:
     names, source = recording.joint_names, recording.label
+    margins = margin * np.array(radians(types))
     if limits.shape != (len(names), 2) or np.any(np.isnan(limits)) or np.any(limits[:, 0] > limits[:, 1]):
         raise ValueError(
             f"joint_pos_limits has shape {limits.shape}; expected ({len(names)}, 2), lower and upper limit "
@@ -352,11 +354,11 @@ def _check_limits(recording: Recording, limits: np.ndarray, margin: float, types
         for key, values in (("dof_pos", recording.dof_pos), ("des_dof_pos", recording.des_dof_pos))
         if values is not None
     }
-    over = (excess["dof_pos"] > margin) & (excess["dof_pos"] <= _FURTHEST)
+    over = (excess["dof_pos"] > margins) & (excess["dof_pos"] <= _FURTHEST)
     doubted = np.array([name not in recording.unit_stated for name in names])
-    kept = over & (_swings_beyond(recording, limits, margin) | (~doubted & (2 * over.sum() < max(len(names), 3))))
+    kept = over & (_swings_beyond(recording, limits, margins) | (~doubted & (2 * over.sum() < max(len(names), 3))))
     for key, allowed in (
-        ("dof_pos", np.where(kept, _FURTHEST, margin)),
+        ("dof_pos", np.where(kept, _FURTHEST, margins)),
         ("des_dof_pos", np.full(len(names), _FURTHEST)),
     ):
         if key in excess and np.any(excess[key] > allowed):
@@ -379,18 +381,18 @@ def _check_limits(recording: Recording, limits: np.ndarray, margin: float, types
     return notes
 
 
-def _swings_beyond(recording: Recording, limits: np.ndarray, margin: float) -> np.ndarray:
+def _swings_beyond(recording: Recording, limits: np.ndarray, margins: np.ndarray) -> np.ndarray:
     """Which joints pass their limits by a swing about their commands, and not by a wrong zero, (n,) bool."""
     if (target := recording.des_dof_pos) is None:
         return np.zeros(recording.num_joints, dtype=bool)
-    within = (target.min(axis=0) >= limits[:, 0] - margin) & (target.max(axis=0) <= limits[:, 1] + margin)
+    within = (target.min(axis=0) >= limits[:, 0] - margins) & (target.max(axis=0) <= limits[:, 1] + margins)
     if len(target) != recording.num_samples:
         clock = np.linspace(recording.time[0], recording.time[-1], len(target))
         clock = clock if recording.des_time is None else recording.des_time
         target = target[np.clip(np.searchsorted(clock, recording.time, side="right") - 1, 0, None)]
     centred = recording.dof_pos - np.median(recording.dof_pos - target, axis=0)
     beyond = np.maximum(limits[:, 0] - centred.min(axis=0), centred.max(axis=0) - limits[:, 1])
-    return within & (beyond > margin)
+    return within & (beyond > margins)
 
 
 def _limit_passed(recording: Recording, joint: int, limits: np.ndarray, joint_type: JointType) -> str:

@@ -519,7 +519,11 @@ def rates_of(logs: Sequence[Log], columns: ColumnMap) -> list[str]:
     """What was understood of logs with the same columns, a line for each series: where from, unit, rate, longest gap."""
     lines = []
     for series in (*MEASURED_SERIES, *CONDITIONS, *COMMAND_SERIES):
-        by = {name: sources[series] for name, sources in columns.joints.items() if series in sources}
+        by = {
+            name: sources[series]
+            for name, sources in columns.joints.items()
+            if series in sources and sources[series].channel in logs[0].channels  # a map may have more joints
+        }
         for names, source in _alike(logs[0], by):
             channels = [log.channels[source.channel] for log in logs if source.channel in log.channels]
             gap = max(float(np.diff(each.time).max(initial=0.0)) for each in channels)

@@ -438,6 +438,15 @@ def test_a_map_gives_units_signs_offsets_gear_ratios_currents_and_facts(tmp_path
     assert read_map(tmp_path / "again.toml") == chosen
 
 
+def test_a_map_may_have_a_joint_that_robot_and_log_lack(tmp_path):
+    path = rows(["time", "hip pos", "hip cmd"], [STAMPS / 1e9, POS[:, 0], HELD[:, 0]], tmp_path / "leg.csv")
+    entries = [f'[joints.{joint}]\ndof_pos = "{joint} pos"\ndes_dof_pos = "{joint} cmd"\n' for joint in ("hip", "grip")]
+    (tmp_path / "map.toml").write_text("".join(entries))
+    reader = LogReader([str(path)], read_map(tmp_path / "map.toml"))
+    (recording,) = reader.recordings(str(path), Robot(joint_names=("hip",), wanted=("hip",)))
+    assert recording.joint_names == ("hip",) and not any("grip" in line for line in reader.lines())
+
+
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
