@@ -27,7 +27,8 @@ from pace_optim.motion.design.motion_check import (
     summarise,
 )
 from pace_optim.motion.signals import Trajectory, make_excitation, write_command_csv
-from pace_optim.problem.drive_steps import of_joints, set_control_step, set_drive_step
+from pace_optim.problem.drive_facts import of_joints
+from pace_optim.problem.drive_steps import set_control_step, set_drive_step
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.recording import SUFFIXES, save_recording, written_files
 

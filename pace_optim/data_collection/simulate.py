@@ -12,7 +12,7 @@ import torch
 
 from pace_envs.tasks.pace import PaceCfg
 from pace_optim.motion.signals import Trajectory
-from pace_optim.problem.drive_steps import of_joints
+from pace_optim.problem.drive_facts import of_joints
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.rollout import Rollout
 from pace_optim.recording import Drive, Load, Recording, conform_recording

@@ -20,9 +20,9 @@ from scipy.spatial.transform import Rotation
 from pace_actuators.text import listed
 from pace_envs import ManagerBasedEnv
 from pace_envs.motor_coordinates import DrivenJoints
+from pace_optim.problem.drive_facts import acting_gains, asked_torque, drive_in
 from pace_optim.problem.inverse_dynamics import LinkMotion, bounded_least_squares, frame_motion, model_of
 from pace_optim.problem.kinematic_trees import independent_trees
-from pace_optim.problem.log_and_robot import asked_torque, gains
 from pace_optim.recording import Recording
 from pace_optim.recording.carried import free_phases, standing_feet
 from pace_optim.recording.data import ImuPose
@@ -271,12 +271,13 @@ def _balances(
         links[part] = motion.torque(base[part], point)
     delays = np.unique(np.linspace(0, math.ceil(float(sim2real.bounds["delay"][0, 1])), _DELAYS).round().astype(int))
     between = 0.5 * max(np.diff(delays), default=1) * recording.control_dt
-    kp, kd = gains(env, recording)
+    own = drive_in(env, recording)
+    kp, kd = acting_gains(own, recording)
     bias = kp * sim2real.bounds["encoder_bias"].abs().max(dim=1).values.numpy()
     nothing, anything, late = np.zeros_like(kp), np.full_like(kp, np.inf), np.full_like(kp, between)
     result = []
     for delay in delays.tolist():
-        drive = gaussian_filter1d(asked_torque(env, _later(recording, delay)), width, axis=0)
+        drive = gaussian_filter1d(asked_torque(own, _later(recording, delay)), width, axis=0)
         terms = [acceleration, speed, direction, np.ones_like(speed), np.gradient(drive, dt, axis=0)]
         result.append(
             _Balance(

@@ -17,7 +17,7 @@ from pace_actuators.joint_units import radians, units_for
 from pace_actuators.text import listed
 from pace_envs.model_file import is_model_file, read_model_file
 from pace_envs.motor_coordinates import joint_ranges
-from pace_optim.problem.drive_steps import of_joints
+from pace_optim.problem.drive_facts import of_joints
 from pace_optim.recording import Recording, conform_recording
 from pace_optim.recording.commands import command_interval
 from pace_optim.recording.conform import of_motors, with_columns
@@ -279,8 +279,8 @@ def _held(
             moving.setdefault(label, []).append(f"{name} by {units_for(f'{span:.3g} rad', [types[name]])}")
         elif high - low > still[name]:
             held[name] = rests[len(rests) // 2][0]
-            places = (units_for(f"{place:.3g} rad", [types[name]]) for place in (low, high))
-            elsewhere.append(f"{name} rests at {next(places)} in {first}, at {next(places)} in {last}")
+            here, there = (units_for(f"{place:.3g} rad", [types[name]]) for place in (low, high))
+            elsewhere.append(f"{name} rests at {here} in {first}, at {there} in {last}")
     if moving and not is_asked:
         label, those = next(iter(moving.items()))
         raise ValueError(
