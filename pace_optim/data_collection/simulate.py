@@ -79,6 +79,8 @@ class Encoder:
     """2^bits steps per turn; ``None`` does not round."""
     rng: np.random.Generator
     """Source of the noise."""
+    radians: tuple[float, ...] = (1.0,)
+    """What counts as a radian of each joint [rad, of slides m]: steps are parts of it."""
 
     @property
     def is_exact(self) -> bool:
@@ -90,7 +92,7 @@ class Encoder:
         if self.noise:
             position = position + self.rng.normal(0.0, self.noise, position.shape)
         if self.bits is not None:
-            step = 2 * np.pi / 2**self.bits
+            step = 2 * np.pi / 2**self.bits * np.array(self.radians)
             position = np.round(position / step) * step
         return position
 

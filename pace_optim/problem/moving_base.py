@@ -68,6 +68,10 @@ def on_moving_base(recording: Recording, env: ManagerBasedEnv) -> Recording:
         for leg, joints in enumerate(legs):
             free[:, joints] &= free_phases(standing[:, leg], dt)[sample][:, None]
         said = f"{how}: {_swings(recording, names, legs, free)}"
+        without = [tree[0] for tree in trees_of(env) if not any(set(tree) & set(leg) for leg in legs)]
+        if without:
+            footless = listed((recording.joint_names[joint] for joint in without), 6)
+            said += f" No foot is on the legs or arms of {footless}, which count as free: name all feet that touch."
     notes = (*recording.notes, f"The base moves as the IMU shows, and {said}")
     return replace(recording, frame=frame, frame_point=point, free=free, notes=notes)
 

@@ -78,7 +78,9 @@ def load_recording(
         fields = _read_pt(path) if suffix == ".pt" else _read_npz(path)
     beside, notes = facts_beside(path)
     fields = with_shared_facts(with_facts(fields, beside, path), facts or {}, joint_names)
-    if rate and "time" not in fields and "dof_pos" in fields:
+    if rate and "time" in fields:
+        notes = [*notes, f"The rate of {rate:g} Hz is not used: the file has the time."]
+    elif rate and "dof_pos" in fields:
         fields["time"] = np.arange(len(as_array(fields["dof_pos"]))) / rate
     recording = check_recording(fields, source=str(path), default_name=path.stem, found=found)
     return replace(recording, notes=(*recording.notes, *notes))

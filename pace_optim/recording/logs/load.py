@@ -421,6 +421,11 @@ def fields_of(log: Log, columns: ColumnMap, joint_names: Sequence[str]) -> tuple
         time = max(clocks, key=len)
         time = time[(time >= begin) & (time <= end)]
         notes.append("Positions of the joints were logged at different instants: put on those of one by cubics.")
+    of_column: dict[str, list[str]] = {}
+    for name in joint_names:
+        of_column.setdefault(columns.joints[name]["dof_pos"].channel, []).append(name)
+    twice = [f"{key} ({listed(those)})" for key, those in of_column.items() if len(those) > 1]
+    notes += [f"One column holds the positions of several joints: {listed(twice)}."] if twice else []
     if len(time) < 2:
         raise ValueError(f"{log.name}: the positions of {listed(joint_names)} have no time in common. Check the log.")
     first = float(time[0])

@@ -148,9 +148,10 @@ def _unfolded(name: str, column: Any, names: tuple[str, ...]) -> Iterator[tuple[
             yield name, values if values.dtype.kind in "iuf" else values.astype(np.float64)
         return
     rows = column.to_pylist()
-    length = next((len(row) for row in rows if row is not None), 0)
-    if not length or not isinstance(rows[0], list) or isinstance(rows[0][0], (list, str)):
+    first = next((row for row in rows if row), None)
+    if not isinstance(first, list) or isinstance(first[0], (list, str)):
         return
+    length = len(first)
     values = np.array(
         [row if row is not None and len(row) == length else [np.nan] * length for row in rows], dtype=float
     )
@@ -275,8 +276,9 @@ def _time(
         best = max(usable, key=lambda name: _share_rising(columns[name]))
         unit = (chosen.time_unit if chosen else "") or ("ns" if best in joined else time_unit(best))
         time, origin, note = _seconds(path, best, columns[best], unit)
-        others = [name for name in usable if name != best]
-        return best, time, origin, " ".join([note, *(_beside(best, time, name, columns[name]) for name in others)])
+        others = [_beside(best, time, name, columns[name]) for name in usable if name != best]
+        others += [f"The rate of {chosen.rate:g} Hz is not used."] if chosen and chosen.rate else []
+        return best, time, origin, " ".join([note, *others])
     if chosen and chosen.rate:
         count = len(next(iter(columns.values())))
         return "", np.arange(count) / chosen.rate, 0.0, f"Time is the row's number at the stated {chosen.rate:g} Hz."

@@ -16,6 +16,7 @@ from recordings import says
 from pace_optim.commands import import_log
 from pace_optim.recording import load_recording, save_recording
 from pace_optim.recording.logs import LogReader, Robot, paired_files, read_map, tables, write_map
+from pace_optim.recording.logs.column_map import ColumnMap, Source
 from pace_optim.recording.logs.rosbag import rows_of
 from pace_optim.recording.logs.words import meaning
 from pace_optim.terminal.cli import run_cli
@@ -436,6 +437,22 @@ def test_a_map_gives_units_signs_offsets_gear_ratios_currents_and_facts(tmp_path
     assert recording.drive.stiffness.tolist() == [40.0, 40.0] and recording.drive.damping.tolist() == [1.0, 2.0]
     write_map(tmp_path / "again.toml", chosen)
     assert read_map(tmp_path / "again.toml") == chosen
+
+
+def test_a_map_with_an_infinite_limit_and_a_long_rate_reads_back_the_same(tmp_path):
+    source = Source(channel="q", unit="rad")
+    facts = {"effort_limit": {"hip": np.inf, "knee": 3.0}, "velocity_limit": [np.inf, 2.0], "comment": "two"}
+    columns = ColumnMap(joints={"hip": {"dof_pos": source}}, facts=facts, rate=1234.56789)
+    write_map(tmp_path / "map.toml", columns)
+    assert read_map(tmp_path / "map.toml") == columns
+
+
+def test_a_list_column_whose_first_row_is_empty_is_read(tmp_path):
+    rows_of_lists = [None, *POS[1:].tolist()]
+    columns = {"q": pa.array(rows_of_lists), "cmd": pa.array(HELD.tolist()), "time": STAMPS / 1e9}
+    parquet.write_table(pa.table(columns), tmp_path / "leg.parquet")
+    (recording,) = load_recordings(tmp_path / "leg.parquet", ROBOT)
+    assert recording.dof_pos == pytest.approx(POS[1:])
 
 
 def test_a_map_may_have_a_joint_that_robot_and_log_lack(tmp_path):

@@ -135,6 +135,38 @@ def test_a_log_without_time_is_read_at_a_stated_rate(tmp_path):
     assert own.time == pytest.approx(TIME)
 
 
+def test_a_rate_that_a_log_with_time_does_not_need_is_named(tmp_path):
+    found = read(table(tmp_path / "log.csv", **arm()), columns=with_rate(None, 100.0))
+    assert found.recording.duration == pytest.approx(TIME[-1])
+    assert any("The rate of 100 Hz is not used" in line for line in found.lines)
+    own = {"time": TIME, "dof_pos/j": MOTION, "des_dof_pos/j": TARGET}
+    recording = load_recording(table(tmp_path / "own.csv", **own), rate=100.0)
+    assert any("The rate of 100 Hz is not used" in note for note in recording.notes)
+
+
+def test_one_column_of_two_joints_is_named(tmp_path):
+    (tmp_path / "map.toml").write_text(
+        "".join(f'[joints.{j}]\ndof_pos = "q_elbow"\ndes_dof_pos = "des_{j}"\n' for j in ARM.joint_names)
+    )
+    found = read(table(tmp_path / "log.csv", **arm()), columns=read_map(tmp_path / "map.toml"))
+    assert any("several joints: q_elbow (shoulder, elbow)" in note for note in found.recording.notes)
+
+
+def test_rows_without_a_date_are_left_out(tmp_path):
+    stamps = (np.datetime64("2026-11-25T10:00:00") + (1e9 * TIME).astype("timedelta64[ns]")).astype(str)
+    for empty in (0, 5, len(TIME) - 1):
+        cells = ["" if k == empty else f"{stamp}+01:00" for k, stamp in enumerate(stamps)]
+        rows = [f"{cell},{q:.6f},{target:.6f}" for cell, q, target in zip(cells, MOTION, TARGET, strict=True)]
+        (tmp_path / "log.csv").write_text("\n".join(["date,q_j,des_j", *rows]))
+        found = read(tmp_path / "log.csv", Robot()).recording
+        assert found.num_samples == len(TIME) - 1 and found.duration < TIME[-1] + 1e-6
+    time = stamps.astype("datetime64[ns]")
+    time[5] = np.datetime64("NaT")
+    np.savez(tmp_path / "own.npz", time=time, dof_pos=MOTION[:, None], des_dof_pos=TARGET[:, None])
+    with pytest.raises(ValueError, match="time has 1 values that are NaN"):
+        load_recording(tmp_path / "own.npz")
+
+
 def test_a_map_may_say_the_time_alone(tmp_path):
     path = table(tmp_path / "log.csv", zeit=TIME, q_j=MOTION, des_j=TARGET)
     (tmp_path / "map.toml").write_text('[time]\ncolumn = "zeit"\nunit = "s"\n')
