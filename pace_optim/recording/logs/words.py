@@ -143,12 +143,15 @@ _UNIT_WORDS = {
 
 _BRACKET = re.compile(r"[\[(]\s*([^\[(\])]*?)\s*[\])]\s*$")
 _SYMBOL = (
-    r"(?:[mµuk]?n(?:mm|cm|dm|m)?|(?:kgf?|gf?)(?:mm|cm|m)|oz(?:in)?|in(?:lbf?)?|inch(?:es)?|lbf?(?:in|ft)?|f(?:oo)?t(?:lbf?)?|"
-    r"[mcdµuk]?m|[mcdµu]?rad|[mcdµu]?deg|[mcdµu]?°|[mcdµu]?degrees?|g(?:rad|on)|turns?|rev(?:s|olutions?)?|rot|"
+    r"(?:1/s(?:ec)?|1/min|(?:da|[mµuk])?n(?:mm|cm|dm|m)?|(?:kgf?|gf?)(?:mm|cm|m)|oz(?:in)?|in(?:lbf?)?|inch(?:es)?|"
+    r"lbf?(?:in|ft)?|f(?:oo)?t(?:lbf?)?|"
+    r"[mcdµuk]?m|[mcdµu]?rad|[mcdµu]?deg|[mcdµu]?°|[mcdµu]?degrees?|g(?:rad|on)|turns?|rev(?:s|olutions?)?|"
     r"ticks?|counts?|cnts?|inc(?:rements?)?|lsb|steps?|pulses?|bits?|raw|digits?|[mk]?a|[mk]?v|[mk]?hz|rpm|dps|rps|"
     r"°c|°f|deg ?[cf]|[cfk]|%|‰|[mµun]?s|sec|min|h|[mk]?g|kgf|gf|ozf?|[mk]?w|[mk]?j)"
 )
-_LIKE_A_UNIT = re.compile(rf"(?:\d+(?:\.\d+)?(?:e-?\d+)? ?)?{_SYMBOL}(?:[ _.·⋅*/^-]{{0,2}}(?:{_SYMBOL}|-?[123²]))*")
+_LIKE_A_UNIT = re.compile(
+    rf"(?:\d+(?:\.\d+)?(?:e-?\d+)? ?)?{_SYMBOL}(?:[ _.·⋅*/-]{{1,2}}{_SYMBOL}|\^-?[123]|[²³]|(?<=/s)2)*"
+)
 """What stands in brackets behind a name and is a unit, known or not: no joint's name or number."""
 
 _SEAMS = re.compile(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])|(?<=[A-Za-z])(?=\d)|(?<=\d)(?=[A-Za-z])")
@@ -258,8 +261,6 @@ def meaning(name: str, table: str = "", joint: tuple[int, int] | None = None) ->
     if not unit and quantity == EFFORT and said & _EFFORT == {"load"}:
         unit, of_unit = "%", EFFORT  # a servo's register, of a duty or of its largest torque
     unit = unit if of_unit in ("", quantity) else ""
-    if len(unknown) == 1 and quantity not in (TEMPERATURE, VOLTAGE):
-        unknown = ""  # a letter may name a joint
     return Meaning(quantity=quantity, commanded=commanded, unit=unit, joint=tuple(label), unknown_unit=unknown)
 
 
@@ -379,6 +380,8 @@ def _unknown_unit(name: str) -> str:
     bracket = _BRACKET.search(name)
     if bracket is None or not _LIKE_A_UNIT.fullmatch(bracket[1].lower()):
         return ""
+    if len(bracket[1]) == 1 and not set(words(name)) & set(_CONDITIONS):
+        return ""  # a letter may name a joint
     text = f"[{bracket[1].lower()}]"
     known = any(re.search(rf"^\[?(?:{pattern})\]?$", text) for pattern, _, _ in _UNIT_PATTERNS)
     return "" if known else bracket[1]

@@ -272,7 +272,9 @@ def test_positions_in_an_unknown_unit_are_not_taken_for_radians(tmp_path, monkey
 
 
 def test_brackets_that_hold_a_joint_hold_no_unit():
-    for name, joint in (("pos[hip]", ("hip",)), ("q[0]", ("0",)), ("pos (left knee)", ("left", "knee"))):
+    named = {"pos[hip]": ("hip",), "q[0]": ("0",), "pos (left knee)": ("left", "knee"), "q[jaw]": ("jaw",)}
+    named |= {"pos[j1]": ("j", "1"), "position[m2]": ("m", "2"), "q[k]": ("k",), "q[can]": ("can",)}
+    for name, joint in named.items():
         assert meaning(name).joint == joint and not meaning(name).unknown_unit
 
 
