@@ -173,7 +173,7 @@ def draft_recordings(
     accepts_load = env.cfg.sim2real.apply_load is not None  # type: ignore[attr-defined]
     return [
         conform_recording(
-            _draft(trajectory, drive, load),
+            trajectory.draft(drive, load),
             joint_order=robot.joint_names,
             control_dt=env.step_dt,
             load_bodies=robot.body_names,
@@ -181,21 +181,6 @@ def draft_recordings(
         )
         for trajectory in trajectories
     ]
-
-
-def _draft(trajectory: Trajectory, drive: Drive, load: Load) -> Recording:
-    """The recording before it is made: the encoder at the first target."""
-    target = trajectory.des_dof_pos
-    return Recording(
-        name=trajectory.name,
-        joint_names=trajectory.joint_names,
-        time=trajectory.time,
-        dof_pos=np.repeat(target[:1], len(target), axis=0),
-        des_dof_pos=trajectory.told_pos,
-        des_dof_vel=trajectory.told_vel,
-        drive=drive,
-        load=load,
-    )
 
 
 def _show_to_controllers(robot: Articulation, offset: np.ndarray) -> None:

@@ -27,6 +27,7 @@ from pace_optim.recording import Recording
 from pace_optim.recording.carried import free_phases, standing_feet
 from pace_optim.recording.data import ImuPose
 from pace_optim.recording.keys import did_you_mean
+from pace_optim.recording.time_base import interpolate_linear
 
 
 def on_moving_base(recording: Recording, env: ManagerBasedEnv) -> Recording:
@@ -43,7 +44,7 @@ def on_moving_base(recording: Recording, env: ManagerBasedEnv) -> Recording:
     steps = np.arange(int(at[-1]) + 1)
     when = at if recording.sample_offset is None else at + recording.sample_offset
     shown = np.concatenate([recording.base_ang_vel @ axes.T, recording.base_lin_acc @ axes.T], axis=1)
-    frame = np.stack([np.interp(steps, when, column) for column in shown.T], axis=1)
+    frame = interpolate_linear(when, shown, steps)
     legs, names = joints_of_feet(env, recording.feet, recording.label), recording.feet
     standing, how = standing_feet(recording), "a leg counts while its foot is in the air"
     if standing is None and _gains_are_stated(recording, env):

@@ -220,7 +220,7 @@ def _misreported_gains(problem: Problem, x: torch.Tensor, score: float) -> tuple
 def _nominal_gain(problem: Problem, r: int, field_name: str) -> torch.Tensor:
     """The gain of every joint as the recording, or else the configuration, states it, (n,)."""
     configured = configured_drive(problem.env_cfg, problem.joint_names)
-    return torch.tensor(getattr(in_force(configured, problem.dataset.recordings[r]), field_name))
+    return torch.tensor(np.nan_to_num(getattr(in_force(configured, problem.dataset.recordings[r]), field_name)))
 
 
 def _by_promise(problem: Problem, x: torch.Tensor) -> tuple[list[int], int]:

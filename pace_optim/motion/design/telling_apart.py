@@ -167,17 +167,11 @@ def menu(problem: Problem, joint: int, cfg: MenuCfg) -> Iterator[Choice]:
             yield Choice(
                 words=f"Another recording ({motion}, {cfg.duration:g} s{words})",
                 arguments=f"--excitation {motion} --duration {cfg.duration:g}{also}{arguments}",
-                recording=Recording(
+                recording=replace(
+                    trajectory.draft(facts.drive, facts.load),
                     name=motion,
-                    joint_names=problem.joint_names,
-                    time=trajectory.time,
-                    dof_pos=np.repeat(target[:1], len(target), axis=0),
-                    des_dof_pos=trajectory.told_pos,
-                    des_dof_vel=speeds,
                     command=np.where(told == "position", target, target[:1]),
                     command_vel=None if speeds is None else np.nan_to_num(speeds),
-                    drive=facts.drive,
-                    load=facts.load,
                 ),
             )
 

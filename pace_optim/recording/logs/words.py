@@ -173,7 +173,7 @@ class Meaning:
     joint: tuple[str, ...]
     """Words of the joint's name."""
     unknown_unit: str = ""
-    """A unit that is written and that is none of ours."""
+    """A unit that the name states and that is not known."""
 
 
 def words(name: str) -> list[str]:
