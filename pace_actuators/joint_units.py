@@ -11,6 +11,9 @@ JointType = Literal["hinge", "slide"]
 JOINT_TYPES: tuple[JointType, ...] = ("hinge", "slide")
 """Both; an effect that means something on one of them alone says so in ``joint_types``."""
 
+SLIDE_LENGTH = 0.1
+"""Metres of a slide that count as a radian of a hinge."""
+
 _OF_SLIDES = (
     (r"kg m(\^2|²|<sup>2</sup>)", "kg"),
     (r"\bN m(?![A-Za-z])", "N"),
@@ -45,6 +48,11 @@ def units_for(text: str, joint_types: Iterable[JointType]) -> str:
 def joint_label(joint: str, own: JointType, joint_types: Iterable[JointType], unit: str = "mrad") -> str:
     """A joint's name for a table of errors, with its unit where others have another: "A3 [mm]"."""
     return f"{joint} [{units_for(unit, [own])}]" if len(set(joint_types)) > 1 else joint
+
+
+def radians(joint_types: Iterable[JointType]) -> tuple[float, ...]:
+    """What counts as a radian of each joint [rad, of slides m]."""
+    return tuple(SLIDE_LENGTH if each == "slide" else 1.0 for each in joint_types)
 
 
 def all_hinges(count: int) -> tuple[JointType, ...]:

@@ -36,9 +36,6 @@ LARGEST_AMPLITUDE = 0.5
 TOP_FREQUENCY = 10.0
 """The excitation's amplitude is safe up to this frequency [Hz]."""
 
-SLIDE_LENGTH = 0.1
-"""Metres of a slide that count as a radian of a hinge, in the values above."""
-
 _PHYSICS_STEPS, _FINEST_STEP = 4, 0.0005
 """Physics steps in a control step, and the least time of one [s]."""
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
+from pace_actuators.joint_units import SLIDE_LENGTH
 from pace_envs.closed_loops import ClosedLoops
 from pace_envs.from_model import defaults
 from pace_envs.from_model.actuators import FileDrive, Kind
@@ -128,7 +129,7 @@ def _with_efforts(joints: Sequence[JointFacts]) -> list[JointFacts]:
 
 def _least_effort(joint: JointFacts) -> float:
     """What holds the joint against gravity three times, swings it, and breaks it loose [N m]."""
-    length = defaults.SLIDE_LENGTH if joint.is_slide else 1.0
+    length = SLIDE_LENGTH if joint.is_slide else 1.0
     stiffness = 0.0 if joint.drive is None else joint.drive.stiffness
     swing = (2 * np.pi * defaults.NATURAL_FREQUENCY) ** 2 * defaults.LARGEST_AMPLITUDE * length
     needed = 3.0 * joint.gravity + swing * (joint.inertia + joint.armature)

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from pace_actuators.base_parameters import CARRIED
+from pace_actuators.joint_units import SLIDE_LENGTH
 from pace_envs.from_model import defaults
 from pace_envs.from_model.joints import JointFacts
 
@@ -32,7 +33,7 @@ Bounds = tuple[float, float]
 
 def unit_length(joint: JointFacts) -> float:
     """What counts as a radian: 1 for a hinge, some metres for a slide."""
-    return defaults.SLIDE_LENGTH if joint.is_slide else 1.0
+    return SLIDE_LENGTH if joint.is_slide else 1.0
 
 
 def has_gains(joint: JointFacts) -> bool:
@@ -70,7 +71,7 @@ def runs_continuously(joints: Sequence[JointFacts], model: mujoco.MjModel, contr
 
 def largest_parameters(effort: float, velocity_limit: float, *, is_slide: bool) -> dict[str, float]:
     """What a drive has at most of armature, viscous and Coulomb friction, by its largest torque [N m] and speed."""
-    length = defaults.SLIDE_LENGTH if is_slide else 1.0
+    length = SLIDE_LENGTH if is_slide else 1.0
     speed = min(velocity_limit, defaults.USUAL_SPEED * length)  # of a faster drive friction may take more
     return {
         "armature": effort / (_SLIDE_ACCELERATION if is_slide else _ACCELERATION),

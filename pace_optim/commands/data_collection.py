@@ -106,7 +106,9 @@ def _parser() -> Parser:
     add_several(robot, "--added_mass", "BODY=KG[@X,Y,Z]", "masses added to bodies", action="extend")
     encoder = parser.add_argument_group("encoder")
     encoder.add_argument("--noise", type=number, default=0.0, metavar="RAD", help="standard deviation (default 0)")
-    encoder.add_argument("--encoder_bits", type=int, metavar="B", help="2^B steps per turn (default: exact)")
+    encoder.add_argument(
+        "--encoder_bits", type=int, metavar="B", help="2^B steps per turn, of slides per 0.63 m (default: exact)"
+    )
     files = parser.add_argument_group("files")
     add_overwrite_option(files)
     files.add_argument("--positions_only", action="store_true", help="leave dof_vel out: half the size")

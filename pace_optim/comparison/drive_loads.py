@@ -8,10 +8,10 @@ import numpy as np
 from scipy import signal
 
 from pace_actuators.identified import DRIVE_FIELDS
+from pace_optim.problem.drive_facts import asked_torque, configured_drive, in_force
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.inverse_dynamics import LinkMotion, frame_motion, model_of
 from pace_optim.problem.problem import Problem
-from pace_optim.run.result import configured_drive
 
 _CUTOFF = 10.0
 
@@ -58,32 +58,22 @@ _STRIDE = 10
 def drive_loads(problem: Problem, evaluator: Evaluator, encoder_bias: np.ndarray) -> list[dict[str, Any]]:
     """Of each recording ``{"recording", "joints": {joint: {...}}}``, for ``drives.json``; torques in N m.
 
-    What is asked is computed from what was recorded, without the delay:
-
-        τ = kp (q* − q) + kd (q̇* − q̇) + τ_ff
+    What is asked is computed from what was recorded (:func:`pace_optim.problem.drive_facts.asked_torque`).
 
     Args:
         problem: Its recordings state the drives, with gains that were unknown as found.
         evaluator: Its environments hold each recording's load.
         encoder_bias: Of each joint, (n,) [rad].
     """
-    rollout, configured = evaluator.rollout(1), configured_drive(problem)
+    rollout, configured = evaluator.rollout(1), configured_drive(problem.env_cfg, problem.joint_names)
     result = []
     for r, recording in enumerate(problem.dataset.recordings):
         dt = float(np.median(np.diff(recording.time)))
         position = smoothed(recording.dof_pos, dt)
         speed = np.gradient(position, dt, axis=0)
-        here = recording.sample_steps
-        facts = {name: _in_force(getattr(recording.drive, name), configured[name]) for name in DRIVE_FIELDS}
-        asked = np.zeros_like(position)
-        if recording.command is not None:
-            target_speed = 0.0 if recording.command_vel is None else recording.command_vel[here][: len(speed)]
-            feed_forward = 0.0 if recording.command_effort is None else recording.command_effort[here][: len(speed)]
-            offset = recording.command[here][: len(position)] - recording.dof_pos
-            asked = np.nan_to_num(facts["stiffness"]) * offset + np.nan_to_num(facts["damping"]) * (
-                target_speed - speed
-            )
-            asked = asked + feed_forward
+        drive = in_force(configured, recording)
+        facts = {name: getattr(drive, name) for name in DRIVE_FIELDS}
+        asked = asked_torque(drive, recording, speed, clip=False)
         still = np.zeros_like(position[::_STRIDE])
         model = model_of(rollout.env, r)
         gravity = LinkMotion.of(
@@ -101,8 +91,3 @@ def drive_loads(problem: Problem, evaluator: Evaluator, encoder_bias: np.ndarray
         result.append({"recording": recording.name, "joints": joints})
     rollout.env.close()
     return result
-
-
-def _in_force(stated: Any, configured: np.ndarray) -> np.ndarray:
-    """Per joint, what the recording states, else what the configuration does; NaN where neither does."""
-    return configured if stated is None else np.broadcast_to(np.asarray(stated, dtype=float), configured.shape)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from pace_actuators.files import refuse_place, refuse_taken
+from pace_actuators.joint_units import radians
 from pace_actuators.text import listed
 from pace_envs import ManagerBasedRLEnv, load_env_cfg, registered_tasks
 from pace_envs.registration import make_env
@@ -27,7 +28,8 @@ from pace_optim.motion.design.motion_check import (
     summarise,
 )
 from pace_optim.motion.signals import Trajectory, make_excitation, write_command_csv
-from pace_optim.problem.drive_steps import of_joints, set_control_step, set_drive_step
+from pace_optim.problem.drive_facts import of_joints
+from pace_optim.problem.drive_steps import set_control_step, set_drive_step
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.recording import SUFFIXES, save_recording, written_files
 
@@ -114,7 +116,12 @@ def collect(cfg: CollectionCfg, report: Callable[[str], None] = lambda text: Non
                 trajectories,
                 space=space,
                 truth=truth,
-                encoder=Encoder(noise=cfg.noise, bits=cfg.encoder_bits, rng=np.random.default_rng([cfg.seed, 1])),
+                encoder=Encoder(
+                    noise=cfg.noise,
+                    bits=cfg.encoder_bits,
+                    rng=np.random.default_rng([cfg.seed, 1]),
+                    radians=radians(env.scene["robot"].joint_types),
+                ),
                 drive=cfg.drive(env.scene["robot"].num_joints),
                 load=cfg.load,
             )

@@ -12,7 +12,7 @@ import torch
 
 from pace_envs.tasks.pace import PaceCfg
 from pace_optim.motion.signals import Trajectory
-from pace_optim.problem.drive_steps import of_joints
+from pace_optim.problem.drive_facts import of_joints
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.rollout import Rollout
 from pace_optim.recording import Drive, Load, Recording, conform_recording
@@ -79,6 +79,8 @@ class Encoder:
     """2^bits steps per turn; ``None`` does not round."""
     rng: np.random.Generator
     """Source of the noise."""
+    radians: tuple[float, ...] = (1.0,)
+    """What counts as a radian of each joint [rad, of slides m]: steps are parts of it."""
 
     @property
     def is_exact(self) -> bool:
@@ -90,7 +92,7 @@ class Encoder:
         if self.noise:
             position = position + self.rng.normal(0.0, self.noise, position.shape)
         if self.bits is not None:
-            step = 2 * np.pi / 2**self.bits
+            step = 2 * np.pi / 2**self.bits * np.array(self.radians)
             position = np.round(position / step) * step
         return position
 
@@ -171,7 +173,7 @@ def draft_recordings(
     accepts_load = env.cfg.sim2real.apply_load is not None  # type: ignore[attr-defined]
     return [
         conform_recording(
-            _draft(trajectory, drive, load),
+            trajectory.draft(drive, load),
             joint_order=robot.joint_names,
             control_dt=env.step_dt,
             load_bodies=robot.body_names,
@@ -179,21 +181,6 @@ def draft_recordings(
         )
         for trajectory in trajectories
     ]
-
-
-def _draft(trajectory: Trajectory, drive: Drive, load: Load) -> Recording:
-    """The recording before it is made: the encoder at the first target."""
-    target = trajectory.des_dof_pos
-    return Recording(
-        name=trajectory.name,
-        joint_names=trajectory.joint_names,
-        time=trajectory.time,
-        dof_pos=np.repeat(target[:1], len(target), axis=0),
-        des_dof_pos=trajectory.told_pos,
-        des_dof_vel=trajectory.told_vel,
-        drive=drive,
-        load=load,
-    )
 
 
 def _show_to_controllers(robot: Articulation, offset: np.ndarray) -> None:

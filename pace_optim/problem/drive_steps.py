@@ -11,6 +11,7 @@ import numpy as np
 
 from pace_envs import ManagerBasedEnv, ManagerBasedRLEnv, set_physics_dt
 from pace_envs.tasks.pace import PaceSim2realEnvCfg
+from pace_optim.problem.drive_facts import acting_gains, drive_in, gains, of_joints
 from pace_optim.recording import Recording
 
 _FINE = 0.5
@@ -110,8 +111,7 @@ def check_loops(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> list
     surely, likely = (_inverse_inertia(env, upper=upper) for upper in (True, False))
     notes = []
     for recording in recordings:
-        kp = _stated(recording.drive.stiffness, of_joints(env, "stiffness"))
-        kd = _stated(recording.drive.damping, of_joints(env, "damping"))
+        kp, kd = acting_gains(drive_in(env, recording), recording)
         pull = _pull(env, recording)
         note = ""
         for inverse, certain in ((surely, True), (likely, False)):
@@ -147,20 +147,14 @@ def least_armature(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> n
 def _pull(env: ManagerBasedRLEnv, recording: Recording) -> np.ndarray:
     """Inertia that a loop which holds its torque asks for, twice: kd dt + kp dt² / 2, (n,) [kg m²]."""
     dt = of_joints(env, "_run_dt")
-    kp = _stated(recording.drive.stiffness, of_joints(env, "stiffness"))
-    kd = _stated(recording.drive.damping, of_joints(env, "damping"))
+    kp, kd = acting_gains(drive_in(env, recording), recording)
     return np.where(dt > 0, kd * dt + 0.5 * kp * dt**2, 0.0)
 
 
 def loop_gains(env: ManagerBasedEnv, recordings: Sequence[Recording]) -> tuple[np.ndarray, np.ndarray]:
     """Stiffness [N m/rad] and damping [N m s/rad] of each joint's loop, means of the recordings', (n,) each."""
-    kp = [_stated(each.drive.stiffness, of_joints(env, "stiffness")) for each in recordings]
-    kd = [_stated(each.drive.damping, of_joints(env, "damping")) for each in recordings]
-    return np.mean(kp, axis=0), np.mean(kd, axis=0)
-
-
-def _stated(own: np.ndarray | None, configured: np.ndarray) -> np.ndarray:
-    return configured if own is None else np.broadcast_to(np.asarray(own, dtype=float), configured.shape)
+    kp, kd = np.mean([gains(drive_in(env, each)) for each in recordings], axis=0)
+    return kp, kd
 
 
 def _armature(env: ManagerBasedRLEnv, upper: bool) -> np.ndarray:
@@ -168,20 +162,6 @@ def _armature(env: ManagerBasedRLEnv, upper: bool) -> np.ndarray:
     own = of_joints(env, "armature")
     bounds = env.cfg.sim2real.bounds["armature"].numpy()  # type: ignore[attr-defined]
     return bounds[:, 1] if upper else np.clip(own, bounds[:, 0], bounds[:, 1])
-
-
-def of_joints(env: ManagerBasedEnv, name: str, only_implicit: bool = False) -> np.ndarray:
-    """A drive's values per joint, (n,); ``_run_dt``: time between two runs of a loop that holds its torque [s]."""
-    robot = env.scene["robot"]
-    result = np.zeros(robot.num_joints)
-    for drive in robot.actuators.values():
-        ids = drive.joint_indices
-        where = ids if isinstance(ids, slice) else np.asarray(ids)
-        if name == "_run_dt":
-            result[where] = 0.0 if drive.cfg.implicit else drive.run_dt
-        elif drive.cfg.implicit or not only_implicit:
-            result[where] = getattr(drive, name)[0].cpu().numpy()
-    return result
 
 
 def _inverse_inertia(env: ManagerBasedRLEnv, upper: bool) -> np.ndarray:

@@ -209,7 +209,9 @@ class Evaluator:
         parts = [
             self._residuals(part, where, offset) for part, offset in zip(physical.split(widest), offsets, strict=False)
         ]
-        return parts[0] if len(parts) == 1 else replace(parts[0], error=torch.cat([part.error for part in parts]))
+        if len(parts) == 1:
+            return parts[0]
+        return replace(parts[0], error=torch.cat([part.error for part in parts]), prior=self._prior(physical))
 
     def look_at_phases(self, physical: torch.Tensor, anew: bool = False) -> bool:
         """See how errors depend on what is not known of free phases, at a candidate: it is taken out of them.

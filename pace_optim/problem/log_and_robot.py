@@ -13,22 +13,19 @@ import torch
 from numpy.typing import ArrayLike
 
 from pace_actuators.base_parameters import CARRIED
-from pace_actuators.joint_units import JointType, units_for
+from pace_actuators.joint_units import SLIDE_LENGTH, JointType, units_for
 from pace_actuators.text import listed
-from pace_envs import ManagerBasedEnv, ManagerBasedRLEnv
-from pace_envs.from_model import defaults
+from pace_envs import ManagerBasedRLEnv
 from pace_envs.from_model.scaling import OF_BOUNDS, largest_parameters
 from pace_envs.tasks.pace import PaceSim2realEnvCfg
 from pace_envs.tasks.pace.pace_cfg import PaceCfg
-from pace_optim.problem.drive_steps import of_joints
+from pace_optim.problem.drive_facts import asked_torque, drive_in, effort_limit, gains, of_joints
 from pace_optim.recording import Recording
 from pace_optim.recording.commands import acting_loops
 from pace_optim.recording.dataset import Dataset, Work
 
 _PLACEHOLDER = 10.0
 """Times what a drive was asked for that its effort limit may be at most."""
-_SMOOTH = 0.02
-"""Positions are averaged over this time before they are differentiated [s]."""
 
 
 def widen_bounds(sim2real: PaceCfg, env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> None:
@@ -64,49 +61,16 @@ def widen_bounds(sim2real: PaceCfg, env: ManagerBasedRLEnv, recordings: Sequence
 
 def _scales(env: ManagerBasedRLEnv, sim2real: PaceCfg, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     """Least and most that a recording says of each drive's largest torque, (n,) each [N m]; 0 and infinity: nothing."""
-    drive, configured = recording.drive, of_joints(env, "effort_limit")
-    length = np.where(np.isin(sim2real.joint_order, sim2real.slide_joints), defaults.SLIDE_LENGTH, 1.0)
+    drive, own = recording.drive, drive_in(env, recording)
+    length = np.where(np.isin(sim2real.joint_order, sim2real.slide_joints), SLIDE_LENGTH, 1.0)
     if drive.stiffness is None and drive.damping is None:
         asked, most = np.zeros(len(length)), np.full(len(length), np.inf)
     else:
-        kp = of_joints(env, "stiffness") if drive.stiffness is None else drive.stiffness
-        asked = np.maximum(0.5 * kp * length, np.abs(asked_torque(env, recording)).max(axis=0))
+        asked = np.maximum(0.5 * gains(own)[0] * length, np.abs(asked_torque(own, recording)).max(axis=0))
         most = _PLACEHOLDER * asked
-    limit = configured if drive.effort_limit is None else drive.effort_limit
+    limit = effort_limit(own)
     known = np.isfinite(limit) & (drive.effort_limit is not None)
     return np.where(np.isfinite(limit), np.where(known, limit, 0.0), asked), np.where(known, np.inf, most)
-
-
-def _half(recording: Recording) -> int:
-    """Samples on each side that a position is averaged with."""
-    return max(1, round(0.5 * _SMOOTH * (recording.num_samples - 1) / recording.duration))
-
-
-def asked_torque(env: ManagerBasedEnv, recording: Recording) -> np.ndarray:
-    """What the drives were asked for, within the limits in force, (T, n) [N m]."""
-    speed = np.gradient(_smooth(recording.dof_pos, _half(recording)), recording.time, axis=0)
-    kp, kd = gains(env, recording)
-    steps = recording.sample_steps
-    asked_speed = 0.0 if recording.command_vel is None else recording.command_vel[steps]
-    torque = kp * (recording.sampled_command - recording.dof_pos) + kd * (asked_speed - speed)
-    torque += 0.0 if recording.command_effort is None else recording.command_effort[steps]
-    limit = of_joints(env, "effort_limit") if recording.drive.effort_limit is None else recording.drive.effort_limit
-    return np.clip(torque, -limit, limit)
-
-
-def gains(env: ManagerBasedEnv, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Stiffness [N m/rad] and damping [N m s/rad] of the drives' loops, (n,) each."""
-    kp, kd = (
-        of_joints(env, name) if getattr(recording.drive, name) is None else getattr(recording.drive, name)
-        for name in ("stiffness", "damping")
-    )
-    return kp, kd
-
-
-def _smooth(position: np.ndarray, half: int) -> np.ndarray:
-    """Each position averaged with its neighbours on both sides, (T, n)."""
-    padded = np.pad(position, ((half + 1, half), (0, 0)), mode="edge").cumsum(axis=0)
-    return (padded[2 * half + 1 :] - padded[: -2 * half - 1]) / (2 * half + 1)
 
 
 _STATE = (
@@ -121,7 +85,7 @@ def without_loops_of_torques(env: ManagerBasedRLEnv, recording: Recording) -> Re
     A damping that the recording states stays: it acts on the measured speed.
     """
     drive, names = recording.drive, np.array(recording.joint_names)
-    stiffness, damping = gains(env, recording)
+    stiffness, damping = gains(drive_in(env, recording))
     other = recording.has_velocity_command | recording.has_effort_command
     idle = names[recording.has_position_command & ~other & (stiffness == 0.0)].tolist()
     if idle and drive.stiffness is None:
@@ -249,17 +213,17 @@ _TIMES_ASKED = 2.0
 
 def drive_reach(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> dict[str, float]:
     """The largest torque of each joint's drive [N m]: its limit, else twice what was asked; infinite: not known."""
-    limit = np.max([_limit(env, recording) for recording in recordings], axis=0)
-    asked = np.max([np.abs(asked_torque(env, recording)).max(axis=0) for recording in recordings], axis=0)
+    drives = [drive_in(env, recording) for recording in recordings]
+    limit = np.max([effort_limit(drive) for drive in drives], axis=0)
+    asked = [np.abs(asked_torque(drive, each)).max(axis=0) for drive, each in zip(drives, recordings, strict=True)]
+    asked = np.max(asked, axis=0)
     largest = np.where(np.isfinite(limit), limit, np.where(asked > 0, _TIMES_ASKED * asked, math.inf))
     return dict(zip(env.scene["robot"].joint_names, largest.tolist(), strict=True))
 
 
 def loop_stiffness(env: ManagerBasedRLEnv, recordings: Sequence[Recording]) -> dict[str, float]:
     """The stiffness of each joint's position loop [N m/rad], the median of the recordings' where it has one."""
-    stated = [each.drive.stiffness for each in recordings]
-    own = of_joints(env, "stiffness")
-    median = np.median([own if each is None else each for each in stated], axis=0)
+    median = np.median([gains(drive_in(env, each))[0] for each in recordings], axis=0)
     names = env.scene["robot"].joint_names
     return {name: each for name, each in zip(names, median.tolist(), strict=True) if each > 0 and math.isfinite(each)}
 
@@ -274,7 +238,7 @@ def with_work(dataset: Dataset, env: ManagerBasedRLEnv) -> Dataset:
     for start, recording in zip(dataset.session_start.tolist(), dataset.recordings, strict=True):
         since = recording.time - recording.time[0]
         edges = np.linspace(0.0, since[-1], max(1, round(since[-1] / _BIN)) + 1)
-        square = np.nan_to_num(asked_torque(env, recording)) ** 2
+        square = np.nan_to_num(asked_torque(drive_in(env, recording), recording)) ** 2
         bins = (np.searchsorted(edges, since, side="right") - 1).clip(max=len(edges) - 2)
         count = np.bincount(bins, minlength=len(edges) - 1).clip(min=1)
         squares.append([np.bincount(bins, column, len(edges) - 1) / count for column in square.T])
@@ -285,9 +249,3 @@ def with_work(dataset: Dataset, env: ManagerBasedRLEnv) -> Dataset:
         return dataset
     begin, end, square = (torch.as_tensor(np.concatenate(each, axis=-1)) for each in (begins, ends, squares))
     return replace(dataset, work=Work(begin=begin, end=end, square=square.T))
-
-
-def _limit(env: ManagerBasedRLEnv, recording: Recording) -> np.ndarray:
-    """The limit in force, (n,) [N m]; infinite where none is stated."""
-    stated = recording.drive.effort_limit
-    return np.nan_to_num(of_joints(env, "effort_limit") if stated is None else stated, nan=np.inf, posinf=np.inf)

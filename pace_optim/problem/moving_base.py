@@ -20,13 +20,14 @@ from scipy.spatial.transform import Rotation
 from pace_actuators.text import listed
 from pace_envs import ManagerBasedEnv
 from pace_envs.motor_coordinates import DrivenJoints
+from pace_optim.problem.drive_facts import acting_gains, asked_torque, drive_in
 from pace_optim.problem.inverse_dynamics import LinkMotion, bounded_least_squares, frame_motion, model_of
 from pace_optim.problem.kinematic_trees import independent_trees
-from pace_optim.problem.log_and_robot import asked_torque, gains
 from pace_optim.recording import Recording
 from pace_optim.recording.carried import free_phases, standing_feet
 from pace_optim.recording.data import ImuPose
 from pace_optim.recording.keys import did_you_mean
+from pace_optim.recording.time_base import interpolate_linear
 
 
 def on_moving_base(recording: Recording, env: ManagerBasedEnv) -> Recording:
@@ -43,7 +44,7 @@ def on_moving_base(recording: Recording, env: ManagerBasedEnv) -> Recording:
     steps = np.arange(int(at[-1]) + 1)
     when = at if recording.sample_offset is None else at + recording.sample_offset
     shown = np.concatenate([recording.base_ang_vel @ axes.T, recording.base_lin_acc @ axes.T], axis=1)
-    frame = np.stack([np.interp(steps, when, column) for column in shown.T], axis=1)
+    frame = interpolate_linear(when, shown, steps)
     legs, names = joints_of_feet(env, recording.feet, recording.label), recording.feet
     standing, how = standing_feet(recording), "a leg counts while its foot is in the air"
     if standing is None and _gains_are_stated(recording, env):
@@ -68,6 +69,10 @@ def on_moving_base(recording: Recording, env: ManagerBasedEnv) -> Recording:
         for leg, joints in enumerate(legs):
             free[:, joints] &= free_phases(standing[:, leg], dt)[sample][:, None]
         said = f"{how}: {_swings(recording, names, legs, free)}"
+        without = [tree[0] for tree in trees_of(env) if not any(set(tree) & set(leg) for leg in legs)]
+        if without:
+            footless = listed((recording.joint_names[joint] for joint in without), 6)
+            said += f" No foot is on the legs or arms of {footless}, which count as free: name all feet that touch."
     notes = (*recording.notes, f"The base moves as the IMU shows, and {said}")
     return replace(recording, frame=frame, frame_point=point, free=free, notes=notes)
 
@@ -271,12 +276,13 @@ def _balances(
         links[part] = motion.torque(base[part], point)
     delays = np.unique(np.linspace(0, math.ceil(float(sim2real.bounds["delay"][0, 1])), _DELAYS).round().astype(int))
     between = 0.5 * max(np.diff(delays), default=1) * recording.control_dt
-    kp, kd = gains(env, recording)
+    own = drive_in(env, recording)
+    kp, kd = acting_gains(own, recording)
     bias = kp * sim2real.bounds["encoder_bias"].abs().max(dim=1).values.numpy()
     nothing, anything, late = np.zeros_like(kp), np.full_like(kp, np.inf), np.full_like(kp, between)
     result = []
     for delay in delays.tolist():
-        drive = gaussian_filter1d(asked_torque(env, _later(recording, delay)), width, axis=0)
+        drive = gaussian_filter1d(asked_torque(own, _later(recording, delay)), width, axis=0)
         terms = [acceleration, speed, direction, np.ones_like(speed), np.gradient(drive, dt, axis=0)]
         result.append(
             _Balance(

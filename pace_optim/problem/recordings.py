@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Literal, TypeVar
 import numpy as np
 
 from pace_actuators import match_names
-from pace_actuators.joint_units import units_for
+from pace_actuators.joint_units import radians, units_for
 from pace_actuators.text import listed
 from pace_envs.model_file import is_model_file, read_model_file
 from pace_envs.motor_coordinates import joint_ranges
-from pace_optim.problem.drive_steps import of_joints
+from pace_optim.problem.drive_facts import of_joints
 from pace_optim.recording import Recording, conform_recording
 from pace_optim.recording.commands import command_interval
 from pace_optim.recording.conform import of_motors, with_columns
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T", str, Recording)
 _STILL = 0.02
-"""A joint that moves less is held where it is [rad, of slides m]."""
+"""A joint that moves less is held where it is [rad]; a slide, if it moves less than a tenth of it [m]."""
 
 
 def tell_on_stderr(text: str) -> None:
@@ -101,7 +101,7 @@ def read_logs(
     driven = env.scene["robot"].driven
 
     paths = [paired_files([str(path) for path in group]) for group in groups]
-    reader = LogReader([path for group in paths for path in group], chosen, facts)
+    reader = LogReader([path for group in paths for path in group], chosen, facts, strict)
 
     def read(path: str) -> list[Recording]:
         try:
@@ -262,20 +262,36 @@ def _held(
     robot = env.scene["robot"]
     home = dict(zip(robot.joint_names, robot.data.default_joint_pos[0].tolist(), strict=True))
     types = dict(zip(robot.joint_names, robot.joint_types, strict=True))
-    held, logged, moving = {}, [], []
+    still = dict(zip(robot.joint_names, _STILL * np.array(radians(robot.joint_types)), strict=True))
+    held, logged = {}, []
+    moving: dict[str, list[str]] = {}
+    elsewhere = []
     for name in names:
-        series = [r.dof_pos[:, r.joint_names.index(name)] for r in recordings if name in r.joint_names]
-        held[name] = float(np.median(np.concatenate(series))) if series else home[name]
-        if series:
-            logged.append(name)
-            low, high = min(each.min() for each in series), max(each.max() for each in series)
-            if high - low > _STILL:
-                moving.append(f"{name} by {units_for(f'{high - low:.3g} rad', [types[name]])}")
+        found = [(r.label, r.dof_pos[:, r.joint_names.index(name)]) for r in recordings if name in r.joint_names]
+        held[name] = float(np.median(np.concatenate([each for _, each in found]))) if found else home[name]
+        if not found:
+            continue
+        logged.append(name)
+        label, span = max(((label, float(np.ptp(each))) for label, each in found), key=lambda pair: pair[1])
+        rests = sorted((float(np.median(each)), label) for label, each in found)
+        (low, first), (high, last) = rests[0], rests[-1]
+        if span > still[name]:
+            moving.setdefault(label, []).append(f"{name} by {units_for(f'{span:.3g} rad', [types[name]])}")
+        elif high - low > still[name]:
+            held[name] = rests[len(rests) // 2][0]
+            here, there = (units_for(f"{place:.3g} rad", [types[name]]) for place in (low, high))
+            elsewhere.append(f"{name} rests at {here} in {first}, at {there} in {last}")
     if moving and not is_asked:
+        label, those = next(iter(moving.items()))
         raise ValueError(
-            f"{recordings[0].label}: joints move without a command: {listed(moving, 3)}. Add their commands "
-            "(des_dof_pos, des_dof_vel or des_dof_effort). Or name the joints to identify with --joints; the others "
-            "are then held at their median."
+            f"{label}: joints move without a command: {listed(those, 3)}. Add their commands (des_dof_pos, des_dof_vel "
+            "or des_dof_effort). Or name the joints to identify with --joints; the others are then held at their "
+            "median."
+        )
+    if elsewhere and not is_asked:
+        raise ValueError(
+            f"{listed(elsewhere, 3)}: a joint without commands is held in one place for all recordings. Fit them "
+            "apart, or name the joints to identify with --joints."
         )
     if not held:
         before = [f"{name} at {value:.3g}" for name, value in env.cfg.scene.robot.held_joints.items()]
@@ -289,8 +305,8 @@ def _held(
         else f"where the recordings have them ({listed(logged, 3)}) or the robot begins"
     )
     note = f"{len(held)} {'joint is' if len(held) == 1 else 'joints are'} held, {where}: {listed(places, 3)}."
-    if moving:
-        note += f" In the recordings some move ({listed(moving, 3)}): what that does to the others is not simulated."
+    if others := [*(each for those in moving.values() for each in those), *elsewhere]:
+        note += f" In the recordings some move ({listed(others, 3)}): what that does to the others is not simulated."
     return held, note
 
 

@@ -9,10 +9,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from pace_actuators import match_names, resolve_joint_values
 from pace_actuators.effects import EffectCfg, effect_cfgs
 from pace_actuators.text import listed
 from pace_envs.tasks.pace import GLOBAL, PaceSim2realEnvCfg
+from pace_optim.problem.drive_facts import asked_torque, configured_drive, in_force
 from pace_optim.recording import Recording
 from pace_optim.terminal.choices import UNKNOWN_FACTS
 
@@ -202,27 +202,17 @@ def _reached(
     cfg: PaceSim2realEnvCfg, recordings: Sequence[Recording], joints: Sequence[str]
 ) -> tuple[np.ndarray, np.ndarray]:
     """A torque that the drives were asked for [N m], not the largest, and beyond their largest speed [rad/s], (n,)."""
-    torques, speeds = [], []
+    torques, speeds, configured = [], [], configured_drive(cfg, joints)
     for recording in recordings:
-        kp, kd = (_stated(cfg, [recording], name, joints) for name in ("stiffness", "damping"))
         speed = np.gradient(recording.dof_pos, recording.time, axis=0)
-        wanted = 0.0 if recording.command_vel is None else recording.command_vel[:: recording.sample_stride]
-        error = recording.sampled_command - recording.dof_pos
-        added = 0.0 if recording.command_effort is None else recording.command_effort[:: recording.sample_stride]
-        torque = np.abs(
-            np.where(np.isfinite(kp), kp, 0.0) * error + np.where(np.isfinite(kd), kd, 0.0) * (wanted - speed) + added
-        )
-        torques.append(np.quantile(torque, 0.98, axis=0))
+        asked = asked_torque(in_force(configured, recording), recording, speed, clip=False)
+        torques.append(np.quantile(np.abs(asked), 0.98, axis=0))
         speeds.append(np.quantile(np.abs(speed), 0.99, axis=0))
     return _OF_THE_REACHED * np.max(torques, axis=0), np.max(speeds, axis=0) / _OF_THE_REACHED
 
 
 def _stated(cfg: PaceSim2realEnvCfg, recordings: Sequence[Recording], fact: str, joints: Sequence[str]) -> np.ndarray:
     """A limit as recordings state it, else the configuration, (n,); infinite where neither does."""
-    result = np.full(len(joints), np.inf)
-    for drive in cfg.scene.robot.actuators.values():
-        own = [joints[i] for group in match_names(drive.joint_names_expr, joints) for i in group]
-        if (value := getattr(drive, fact)) is not None:
-            result[[joints.index(j) for j in own]] = resolve_joint_values(value, own, field=fact).numpy()
     values = [v for recording in recordings if (v := getattr(recording.drive, fact)) is not None]
-    return np.max(values, axis=0) if values else result
+    configured = configured_drive(cfg, joints)[fact]
+    return np.max(values, axis=0) if values else np.where(np.isnan(configured), np.inf, configured)

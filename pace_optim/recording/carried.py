@@ -12,6 +12,7 @@ from scipy import ndimage
 
 from .data import Recording
 from .noise import noise_floor
+from .time_base import interpolate_linear
 
 GRAVITY = 9.81
 """[m/s²]."""
@@ -117,7 +118,7 @@ def read_earlier(frame: np.ndarray, delay: float, dt: float) -> np.ndarray:
         dt: Between samples [s].
     """
     at = np.arange(len(frame))
-    return np.stack([np.interp(at + delay / dt, at, column) for column in frame.T], axis=1)
+    return interpolate_linear(at, frame, at + delay / dt)
 
 
 def force_noise(force: np.ndarray, dt: float) -> np.ndarray:

@@ -132,12 +132,14 @@ def _stamps(key: str, value: Any, source: str) -> tuple[np.ndarray, float, str]:
         array = array.astype(np.float64)
         _check_precision(key, array, source)
     try:
-        return seconds_of(array)
+        found = seconds_of(array)
     except ValueError as error:
         raise ValueError(
             f"{source}: {key} holds text such as '{array[0]}' ({error}); expected seconds, or dates as in "
             "2026-11-25T10:30:00.125. Correct it."
         ) from error
+    _check_finite(key, found[0], (), source)
+    return found
 
 
 def _command_time(value: Any, time: np.ndarray, origin: float, source: str) -> np.ndarray | None:

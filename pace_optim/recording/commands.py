@@ -17,6 +17,8 @@ GRID_COMMANDS = {"des_dof_pos": "command", "des_dof_vel": "command_vel", "des_do
 """The field of a conformed recording that holds each command on the control grid."""
 _EVEN = 2e-3
 """An interval this near to a tenth of a millisecond or to a whole number of Hz is that."""
+_OFTEN = 0.1
+"""Part of the changes of the most active joint's command that show another joint's interval."""
 _FOLLOWS = 0.1
 """Part of a command's deviation by which the ticks that are counted follow the timer, whose rate is not known yet."""
 
@@ -71,6 +73,8 @@ def acting_loops(recording: Recording, stiffness: np.ndarray) -> tuple[np.ndarra
 def command_interval(recording: Recording) -> float:
     """Time from one command to the next, as they were logged [s]: repeated commands do not count.
 
+    Instants of a separate clock may be those of several joints' clocks together: the interval is that of one joint.
+
     Args:
         recording: As `load_recording` gives it.
     """
@@ -79,8 +83,13 @@ def command_interval(recording: Recording) -> float:
     every = np.nan_to_num(np.concatenate(series, axis=1))
     if len(every) != len(instants):  # one for each control step
         instants = np.linspace(instants[0], instants[-1], len(every))
-    new = np.flatnonzero((np.diff(every, axis=0) != 0).any(axis=1)) + 1
-    interval = float(np.median(np.diff(instants[new] if len(new) > 1 else instants)))
+    new = np.diff(every, axis=0) != 0
+    changed = [new.any(axis=1)] if recording.des_time is None else list(new.T)
+    most = max(int(each.sum()) for each in changed)
+    steps = [np.diff(instants[1:][each]) for each in changed if each.sum() >= max(2, _OFTEN * most)]
+    if not steps:  # no command follows another: as often as there are commands, or samples
+        steps = [np.diff(instants if len(instants) > 1 else recording.time)]
+    interval = min(float(np.median(each)) for each in steps)
     even = min((1 / max(1, round(1 / interval)), round(interval, 4)), key=lambda each: abs(each - interval))
     return even if abs(even / interval - 1) < _EVEN else interval
 

@@ -8,14 +8,15 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from pace_actuators.joint_units import JointType, all_hinges, units_for
+from pace_actuators.joint_units import JointType, all_hinges, radians, units_for
 from pace_actuators.text import listed
 from pace_envs.motor_coordinates import DrivenJoints
 
 from .checks import MIN_SAMPLES, refuse_uncommanded
 from .commands import GRID_COMMANDS, command_interval, commands_on_grid, timing_note
 from .data import Drive, Recording
-from .keys import COMMAND_SERIES, CONDITIONS, FEET_SERIES, JOINT_SERIES, SAMPLED_SERIES, did_you_mean
+from .gaps import from_first_command
+from .keys import COMMAND_SERIES, CONDITIONS, FEET_SERIES, JOINT_SERIES, did_you_mean
 from .time_base import (
     TimeBase,
     fit_time_base,
@@ -57,7 +58,8 @@ def conform_recording(
         joint_order: The robot's joints, in the order wanted.
         control_dt: Control step of the simulation [s].
         joint_pos_limits: Lower and upper limit per joint of `joint_order`, (n, 2) [rad]; infinite where none.
-        limit_margin: How far a position may lie beyond its limit [rad] (encoder bias, soft stops).
+        limit_margin: How far a position may lie beyond its limit [rad] (encoder bias, soft stops); of a slide, a tenth
+            of it [m].
         joint_types: Whether each joint of `joint_order` turns or slides; none: all turn.
         load_bodies: Bodies that `added_mass` may name.
         accepts_load: Whether the robot has the test bench's load (load_mass, load_length, arm_mass).
@@ -76,7 +78,7 @@ def conform_recording(
     if recording.command is not None:
         _check_conformed(recording, control_dt)
         return recording
-    recording = _from_first_command(recording)
+    recording = from_first_command(recording)
     origin = recording.start_stamp
     # what a torque says of its drive is read from even samples
     base = fit_time_base(recording.time, control_dt, recording.label, may_place=recording.dof_effort is None)
@@ -122,23 +124,6 @@ def _check_conformed(recording: Recording, control_dt: float) -> None:
             f"{recording.label}: is already on a control step of {recording.control_dt:g} s; expected a recording as "
             f"loaded, or one on {control_dt:g} s. Conform the loaded recording."
         )
-
-
-def _from_first_command(recording: Recording) -> Recording:
-    """The recording from where it is known what is commanded."""
-    first = recording.time[0] if recording.des_time is None else recording.des_time[0]
-    before = int(np.searchsorted(recording.time, first))
-    if not before:
-        return recording
-    if recording.num_samples - before < MIN_SAMPLES:
-        raise ValueError(
-            f"{recording.label}: {before} of {recording.num_samples} samples come before the first command, so too "
-            "few are left. Record the commands from the beginning on."
-        )
-    cut = {key: value[before:] for key in ("time", *SAMPLED_SERIES)
-           if (value := getattr(recording, key)) is not None}  # fmt: skip
-    note = f"The first {recording.time[before] - recording.time[0]:.4g} s were left out: no command is known there."
-    return replace(recording, **cut, notes=(*recording.notes, note))
 
 
 def _kept(recording: Recording, base: TimeBase) -> dict[str, Any]:
@@ -358,6 +343,7 @@ def _check_wraps(recording: Recording, turns: np.ndarray) -> None:
 
 def _check_limits(recording: Recording, limits: np.ndarray, margin: float, types: Sequence[JointType]) -> list[str]:
     names, source = recording.joint_names, recording.label
+    margins = margin * np.array(radians(types))
     if limits.shape != (len(names), 2) or np.any(np.isnan(limits)) or np.any(limits[:, 0] > limits[:, 1]):
         raise ValueError(
             f"joint_pos_limits has shape {limits.shape}; expected ({len(names)}, 2), lower and upper limit "
@@ -368,11 +354,11 @@ def _check_limits(recording: Recording, limits: np.ndarray, margin: float, types
         for key, values in (("dof_pos", recording.dof_pos), ("des_dof_pos", recording.des_dof_pos))
         if values is not None
     }
-    over = (excess["dof_pos"] > margin) & (excess["dof_pos"] <= _FURTHEST)
+    over = (excess["dof_pos"] > margins) & (excess["dof_pos"] <= _FURTHEST)
     doubted = np.array([name not in recording.unit_stated for name in names])
-    kept = over & (_swings_beyond(recording, limits, margin) | (~doubted & (2 * over.sum() < max(len(names), 3))))
+    kept = over & (_swings_beyond(recording, limits, margins) | (~doubted & (2 * over.sum() < max(len(names), 3))))
     for key, allowed in (
-        ("dof_pos", np.where(kept, _FURTHEST, margin)),
+        ("dof_pos", np.where(kept, _FURTHEST, margins)),
         ("des_dof_pos", np.full(len(names), _FURTHEST)),
     ):
         if key in excess and np.any(excess[key] > allowed):
@@ -395,18 +381,18 @@ def _check_limits(recording: Recording, limits: np.ndarray, margin: float, types
     return notes
 
 
-def _swings_beyond(recording: Recording, limits: np.ndarray, margin: float) -> np.ndarray:
+def _swings_beyond(recording: Recording, limits: np.ndarray, margins: np.ndarray) -> np.ndarray:
     """Which joints pass their limits by a swing about their commands, and not by a wrong zero, (n,) bool."""
     if (target := recording.des_dof_pos) is None:
         return np.zeros(recording.num_joints, dtype=bool)
-    within = (target.min(axis=0) >= limits[:, 0] - margin) & (target.max(axis=0) <= limits[:, 1] + margin)
+    within = (target.min(axis=0) >= limits[:, 0] - margins) & (target.max(axis=0) <= limits[:, 1] + margins)
     if len(target) != recording.num_samples:
         clock = np.linspace(recording.time[0], recording.time[-1], len(target))
         clock = clock if recording.des_time is None else recording.des_time
         target = target[np.clip(np.searchsorted(clock, recording.time, side="right") - 1, 0, None)]
     centred = recording.dof_pos - np.median(recording.dof_pos - target, axis=0)
     beyond = np.maximum(limits[:, 0] - centred.min(axis=0), centred.max(axis=0) - limits[:, 1])
-    return within & (beyond > margin)
+    return within & (beyond > margins)
 
 
 def _limit_passed(recording: Recording, joint: int, limits: np.ndarray, joint_type: JointType) -> str:

@@ -48,7 +48,10 @@ SUFFIXES = (".pt", ".npz", ".csv")
 
 
 def load_recording(
-    path: str | os.PathLike[str], rate: float = 0.0, facts: Mapping[str, Any] | None = None
+    path: str | os.PathLike[str],
+    rate: float = 0.0,
+    facts: Mapping[str, Any] | None = None,
+    joint_names: Collection[str] = (),
 ) -> Recording:
     """Read a recording and check that it is one; its samples stay as they are in the file.
 
@@ -57,6 +60,7 @@ def load_recording(
             beside it may hold the facts (joint_names, stiffness, added_mass, ...).
         rate: Samples per second of a file without time [Hz]; 0: it has time.
         facts: Those that the file and its JSON file do not state.
+        joint_names: The robot's joints, of which `facts` may name more than the file has.
 
     Raises:
         ValueError: If the file is missing, unreadable, or not a sound recording; the message says what to do.
@@ -73,8 +77,10 @@ def load_recording(
     else:
         fields = _read_pt(path) if suffix == ".pt" else _read_npz(path)
     beside, notes = facts_beside(path)
-    fields = with_shared_facts(with_facts(fields, beside, path), facts or {})
-    if rate and "time" not in fields and "dof_pos" in fields:
+    fields = with_shared_facts(with_facts(fields, beside, path), facts or {}, joint_names)
+    if rate and "time" in fields:
+        notes = [*notes, f"The rate of {rate:g} Hz is not used: the file has the time."]
+    elif rate and "dof_pos" in fields:
         fields["time"] = np.arange(len(as_array(fields["dof_pos"]))) / rate
     recording = check_recording(fields, source=str(path), default_name=path.stem, found=found)
     return replace(recording, notes=(*recording.notes, *notes))
@@ -283,7 +289,8 @@ def with_shared_facts(
     Args:
         joint_names: The robot's joints: values of those that the recording lacks are left out.
     """
-    absent = set(joint_names).difference(as_array(fields.get("joint_names", ())).tolist())
+    own = as_array(fields.get("joint_names", joint_names)).tolist()  # columns without names are the robot's
+    absent = set(joint_names).difference(own)
     shared = {
         key: {name: each for name, each in value.items() if name not in absent}
         if isinstance(value, Mapping) and key in DRIVE_FACTS

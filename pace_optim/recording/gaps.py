@@ -31,7 +31,9 @@ _KEPT = 0.7
 
 
 def split_at_gaps(recording: Recording) -> list[Recording]:
-    """The recording, or its parts between gaps in which joints moved or commands changed.
+    """The recording from its first command on, or its parts between gaps in which joints moved or commands changed.
+
+    A gap of more than 0.5 s splits in any case.
 
     Each part begins in motion, with the commands in force there. The first has a note on where it was split, and why:
     samples are missing, or the clock was set ahead while the motion went on.
@@ -39,10 +41,15 @@ def split_at_gaps(recording: Recording) -> list[Recording]:
     Args:
         recording: As it was read, before it is put on a control grid.
     """
+    recording = from_first_command(recording)
     time = recording.time
     step = np.diff(time)
     usual = float(np.median(step))
-    moving = [int(k) for k in np.flatnonzero(step > max(_STEPS * usual, _SHORTEST)) if not _is_still(recording, int(k))]
+    moving = [
+        k
+        for k in np.flatnonzero(step > max(_STEPS * usual, _SHORTEST)).tolist()
+        if step[k] > _LONGEST or not _is_still(recording, k)
+    ]
     if not moving:
         return [recording]
     least, least_samples = 0.0, max(MIN_SAMPLES, round(_PART / usual))
@@ -73,6 +80,23 @@ def split_at_gaps(recording: Recording) -> list[Recording]:
         _part(recording, a, b, number, note if number == 1 else "", len(parts))
         for number, (a, b) in enumerate(parts, start=1)
     ]
+
+
+def from_first_command(recording: Recording) -> Recording:
+    """The recording from where it is known what is commanded."""
+    first = recording.time[0] if recording.des_time is None else recording.des_time[0]
+    before = int(np.searchsorted(recording.time, first))
+    if not before:
+        return recording
+    if recording.num_samples - before < MIN_SAMPLES:
+        raise ValueError(
+            f"{recording.label}: {before} of {recording.num_samples} samples come before the first command, so too "
+            "few are left. Record the commands from the beginning on."
+        )
+    cut = {key: value[before:] for key in ("time", *SAMPLED_SERIES)
+           if (value := getattr(recording, key)) is not None}  # fmt: skip
+    note = f"The first {recording.time[before] - recording.time[0]:.4g} s were left out: no command is known there."
+    return replace(recording, **cut, notes=(*recording.notes, note))
 
 
 def _is_still(recording: Recording, k: int) -> bool:

@@ -62,7 +62,7 @@ def affordable(
             if max_duration is None and recording.frame is not None:
                 longest = min(longest, _WALKING)
             parts = informative_parts(recording, longest)
-            if parts[0].part_of:
+            if parts[0] is not recording:
                 tell(f"note: {parts[0].notes[-1]}")
             kept += parts
     seconds = sum(recording.duration for kept in result for recording in kept)

@@ -37,8 +37,11 @@ def seconds_of(values: np.ndarray) -> tuple[np.ndarray, float, str]:
     if values.dtype.kind in "UST":
         values = _dates(values)
     if values.dtype.kind == "M":
-        whole = values.astype("datetime64[ns]").astype(np.int64)
-        return (whole - whole[:1]) * 1e-9, float(whole[0]) * 1e-9 if len(whole) else 0.0, "dates"
+        whole, missing = values.astype("datetime64[ns]").astype(np.int64), np.isnat(values)
+        first = whole[~missing][:1]
+        if not len(first):
+            return np.full(len(values), np.nan), 0.0, "dates"
+        return np.where(missing, np.nan, (whole - first) * 1e-9), float(first[0]) * 1e-9, "dates"
     unit = unix_unit(values)
     if unit is None:
         return values.astype(np.float64), 0.0, ""
@@ -103,10 +106,11 @@ def set_back(time: np.ndarray) -> np.ndarray:
 def _dates(values: np.ndarray) -> np.ndarray:
     """Text as datetime64 in UTC; a zone that is written behind each is taken into account."""
     texts = [str(value).strip() for value in values.tolist()]
+    filled = [text for text in texts if text]
     zones = {match.group() if (match := _ZONE.search(text)) and "T" in text.upper().replace(" ", "T") else ""
-             for text in texts[:1] + texts[-1:]}  # fmt: skip
-    zone = zones.pop()
-    if zones or not all(text.endswith(zone) for text in texts):
+             for text in filled[:1] + filled[-1:]}  # fmt: skip
+    zone = zones.pop() if zones else ""
+    if zones or not all(text.endswith(zone) for text in filled):
         raise ValueError("the stamps are of different time zones; write all of them in one")
     bare = np.array([text[: len(text) - len(zone)].replace(" ", "T") for text in texts])
     return bare.astype("datetime64[ns]") - np.timedelta64(_minutes(zone), "m")

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from pace_actuators import match_names, resolve_joint_values
+from pace_actuators import match_names
 from pace_actuators.drive_result import ALL, CURE, DriveResult, LinkInertia
 from pace_actuators.effects import EffectCfg
 from pace_actuators.effects.free_form import FreeForm
@@ -22,6 +22,7 @@ from pace_envs.link_inertia import NAMES
 from pace_envs.tasks.pace import TORQUE_OFFSET, TORQUE_SCALE
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty
 from pace_optim.estimate.error_bars.undetermined import whole_delay
+from pace_optim.problem.drive_facts import configured_drive
 from pace_optim.problem.evaluator import Residuals
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
@@ -196,26 +197,13 @@ def correlation_matrix(space: ParameterSpace, uncertainty: Uncertainty) -> dict[
     return {"labels": list(space.labels), "matrix": rows}
 
 
-def configured_drive(problem: Problem) -> dict[str, np.ndarray]:
-    """Gains and limits as the configuration has them, by field, (n,) each; NaN where it says nothing."""
-    joints = list(problem.joint_names)
-    found = {name: np.full(len(joints), np.nan) for name in DRIVE_FIELDS}
-    for cfg in problem.env_cfg.scene.robot.actuators.values():
-        own = [joints[i] for group in match_names(cfg.joint_names_expr, joints) for i in group]
-        for name, values in found.items():
-            if (value := getattr(cfg, name)) is not None:
-                at = [joints.index(joint) for joint in own]
-                values[at] = resolve_joint_values(value, own, field=name).numpy()
-    return found
-
-
 def drive_in_force(problem: Problem) -> dict[str, dict[str, float]]:
     """Gains and limits per joint that were in force in every recording; one that differed is left out.
 
     A joint that has no limit where others have one is left out too. So a limit that differed is left out of all joints.
     """
     joints, found = list(problem.joint_names), {}
-    recordings, configured = problem.dataset.recordings, configured_drive(problem)
+    recordings, configured = problem.dataset.recordings, configured_drive(problem.env_cfg, problem.joint_names)
     for name in DRIVE_FIELDS:
         stated = [getattr(recording.drive, name) for recording in recordings]
         values = {

@@ -147,6 +147,27 @@ def test_joints_that_move_without_a_command_are_held_only_if_one_asks_for_it(duo
     assert any("some move (right_elbow" in note for note in problem.env_cfg.sim2real.notes)
 
 
+def test_a_slide_that_moves_15_mm_without_a_command_is_not_held_silently(duo, tmp_path):
+    finger = DUO.replace(
+        'name="right_elbow" axis="0 1 0" range="-2 2"', 'name="right_elbow" type="slide" range="0 .04"'
+    )
+    (tmp_path / "duo.xml").write_text(finger)
+    with pytest.raises(ValueError, match=r"log\.npz: joints move without a command: right_elbow by 0\.015 m"):
+        duo({LEFT: MOTION, RIGHT: 0.0075 + 0.025 * MOTION})
+
+
+def test_a_joint_that_rests_in_two_places_is_named_with_both_recordings(duo, tmp_path):
+    duo({LEFT: MOTION, RIGHT: 0.0})
+    (tmp_path / "log.npz").rename(tmp_path / "a.npz")
+    problem = duo({LEFT: MOTION, RIGHT: 0.5})
+    files = [tmp_path / "a.npz", tmp_path / "log.npz"]
+    with pytest.raises(ValueError, match=r"right_elbow rests at 0 rad in .*a\.npz, at 0\.5 rad in .*log\.npz: .*apart"):
+        load_problem(problem.task, data=files, tell=lambda _: None)
+    asked = load_problem(problem.task, data=files, joints="left.*", tell=lambda _: None)
+    assert held(asked)[RIGHT] == 0.5
+    assert any("right_elbow rests at 0 rad" in note for note in asked.env_cfg.sim2real.notes)
+
+
 def test_of_joints_that_all_move_those_asked_for_are_identified(duo):
     both = {LEFT: MOTION, RIGHT: MOTION + 0.5, WAIST: MOTION}
     problem = duo(both, targets=tuple(both), joints="(left|right)_elbow")

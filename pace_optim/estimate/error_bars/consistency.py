@@ -16,7 +16,7 @@ from pace_optim.estimate.error_bars.assessment import assess
 from pace_optim.estimate.error_bars.far_from_noise import noise_score
 from pace_optim.estimate.error_bars.uncertainty import Uncertainty
 from pace_optim.estimate.least_squares import Descent, LeastSquaresCfg, least_squares
-from pace_optim.problem.drive_steps import of_joints
+from pace_optim.problem.drive_facts import configured_drive, in_force
 from pace_optim.problem.parameter_space import ParameterSpace
 from pace_optim.problem.problem import Problem
 
@@ -212,13 +212,8 @@ def _misreported_gains(problem: Problem, x: torch.Tensor, score: float) -> tuple
 
 def _nominal_gain(problem: Problem, r: int, field_name: str) -> torch.Tensor:
     """The gain of every joint as the recording, or else the configuration, states it, (n,)."""
-    stated = getattr(problem.dataset.recordings[r].drive, field_name)
-    if stated is not None:
-        return torch.as_tensor(stated, dtype=torch.float64)
-    env = problem.make_env(1)
-    result = torch.from_numpy(of_joints(env, field_name))
-    env.close()
-    return result
+    configured = configured_drive(problem.env_cfg, problem.joint_names)
+    return torch.tensor(np.nan_to_num(getattr(in_force(configured, problem.dataset.recordings[r]), field_name)))
 
 
 def _most_promising(problem: Problem, x: torch.Tensor) -> tuple[int, float, int]:

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from pace_optim.identification.log_checks.balance import Balance, Links, View, balances
+from pace_optim.recording.time_base import interpolate_linear
 
 _GRAVITY = 9.81
 """[m/s²]."""
@@ -111,7 +112,7 @@ def _earlier(view: View, delay: float) -> View:
     if view.frame is None:
         return view
     at = np.arange(len(view.frame)) * view.dt
-    return replace(view, frame=np.stack([np.interp(at + delay, at, column) for column in view.frame.T], axis=1))
+    return replace(view, frame=interpolate_linear(at, view.frame, at + delay))
 
 
 def _misfit(view: View, links: Links) -> float | None:

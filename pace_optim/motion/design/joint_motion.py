@@ -205,7 +205,11 @@ def _alone(
 ) -> Trajectory:
     """The excitation of a robot that has only this joint."""
     one = cfg.on_joints(cfg.joint_order[j : j + 1]).replace(
-        excitation=ExcitationCfg(bias=(motion.centre / motion.amplitude,), direction=(1.0,), scale=(motion.amplitude,)),
+        excitation=ExcitationCfg(
+            bias=(motion.centre / motion.amplitude if motion.amplitude else 0.0,),  # without amplitude it rests at 0
+            direction=(1.0,),
+            scale=(motion.amplitude,),
+        ),
     )
     return make_excitation(
         excitation,

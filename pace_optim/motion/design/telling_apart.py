@@ -13,10 +13,10 @@ import torch
 from pace_actuators.effects import EffectCfg
 from pace_actuators.joint_units import units_for
 from pace_optim.motion.signals import make_excitation
+from pace_optim.problem.drive_facts import configured_drive, in_force
 from pace_optim.problem.problem import Problem
 from pace_optim.recording import Recording
 from pace_optim.recording.dataset import Dataset, make_dataset
-from pace_optim.run.result import configured_drive
 from pace_optim.terminal.cli import command
 from pace_optim.terminal.parallel import parallel_map
 
@@ -167,17 +167,11 @@ def menu(problem: Problem, joint: int, cfg: MenuCfg) -> Iterator[Choice]:
             yield Choice(
                 words=f"Another recording ({motion}, {cfg.duration:g} s{words})",
                 arguments=f"--excitation {motion} --duration {cfg.duration:g}{also}{arguments}",
-                recording=Recording(
+                recording=replace(
+                    trajectory.draft(facts.drive, facts.load),
                     name=motion,
-                    joint_names=problem.joint_names,
-                    time=trajectory.time,
-                    dof_pos=np.repeat(target[:1], len(target), axis=0),
-                    des_dof_pos=trajectory.told_pos,
-                    des_dof_vel=speeds,
                     command=np.where(told == "position", target, target[:1]),
                     command_vel=None if speeds is None else np.nan_to_num(speeds),
-                    drive=facts.drive,
-                    load=facts.load,
                 ),
             )
 
@@ -215,9 +209,9 @@ def _like(problem: Problem) -> Recording:
 
 def _told(problem: Problem) -> np.ndarray:
     """What each drive follows, (n,): ``position``, ``speed``, or ``torque`` where it has no gains or nothing else."""
-    like, configured = _like(problem), configured_drive(problem)
-    own = {"stiffness": like.drive.stiffness, "damping": like.drive.damping}
-    kp, kd = (np.asarray(configured[name] if value is None else value) for name, value in own.items())
+    like = _like(problem)
+    drive = in_force(configured_drive(problem.env_cfg, problem.joint_names), like)
+    kp, kd = np.asarray(drive.stiffness), np.asarray(drive.damping)
     position, speed = like.has_position_command & (kp != 0), like.has_position_command | like.has_velocity_command
     return np.select([position, speed & (kd != 0)], ["position", "speed"], "torque")
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from pace_actuators.files import write_atomically
 from pace_envs.tasks.pace import PaceCfg
+from pace_optim.recording import Drive, Load, Recording
 
 _MIN_SAMPLES = 20
 
@@ -135,6 +136,19 @@ class Trajectory:
         by_speed, target = self._follows_speed, self.des_dof_pos
         slope = np.diff(target, axis=0, append=target[-1:]) / (self.time[1] - self.time[0])
         return np.where(by_speed, slope, np.nan) if by_speed.any() else None
+
+    def draft(self, drive: Drive, load: Load) -> Recording:
+        """The recording before it is made: the encoder at the first target."""
+        return Recording(
+            name=self.name,
+            joint_names=self.joint_names,
+            time=self.time,
+            dof_pos=np.repeat(self.des_dof_pos[:1], len(self.time), axis=0),
+            des_dof_pos=self.told_pos,
+            des_dof_vel=self.told_vel,
+            drive=drive,
+            load=load,
+        )
 
     @property
     def _follows_speed(self) -> np.ndarray:

@@ -15,6 +15,7 @@ from pace_optim.recording.keys import BASE_COLUMNS
 from pace_optim.recording.time_base import interpolate_nearest
 
 from .log import Log
+from .words import PER_S
 
 BASE_UNITS = {
     "base_ang_vel": {"rad/s": 1.0, "deg/s": np.pi / 180, "mrad/s": 1e-3},
@@ -27,6 +28,16 @@ _WORDS = {
     "base_lin_acc": re.compile(r"lin(ear)?_?acc(el(eration)?)?|acc(el(ero(meter)?)?)?|specific_?force", re.IGNORECASE),
     "base_quat": re.compile(r"orientation|quat(ernion)?", re.IGNORECASE),
 }
+_SPELT = {
+    "mrad/s": rf"mrad{PER_S}|mrad_s",
+    "rad/s": rf"rad(ians?)?{PER_S}|rad_s",
+    "deg/s": rf"deg(rees?)?{PER_S}|deg_s|dps|°/s(ec)?",
+    "mm/s²": r"mm/s(\^?2|²|/s)",
+    "m/s²": r"m[ _]?/[ _]?s(ec)?(\^?2|²|/s)|m_s2|mps2",
+    "mg": "mg",
+    "g": "g",
+}
+"""How units are written at the end of a name."""
 _AXIS = re.compile(r"(?:^|[^a-z])([wxyz])\]?$|([WXYZ])$")
 _CONTACT = re.compile(r"(foot|feet|toe)?[_. /]?contacts?([_. /]?state)?|touch", re.IGNORECASE)
 
@@ -67,26 +78,42 @@ def guess_base(log: Log) -> tuple[BaseMap, list[str]]:
     Args:
         log: Such as a topic ``sensor_msgs/Imu``, or columns ``gyro_x`` and ``acc_x``.
     """
-    found: dict[str, dict[str, dict[str, str]]] = {}
+    found: dict[tuple[str, str, str], dict[str, str]] = {}
+    like_an_imu = []
     for key, channel in log.channels.items():
-        axis = _AXIS.search(key)
         series = next((name for name, word in _WORDS.items() if word.search(channel.name)), "")
-        if axis is None or not series or channel.series:
+        if not series or channel.series:
             continue
-        letter = (axis[1] or axis[2]).lower()
-        found.setdefault(series, {}).setdefault(channel.table, {})[letter] = key
+        bare, unit = _without_unit(key, series)
+        if (axis := _AXIS.search(bare)) is not None:
+            found.setdefault((series, channel.table, unit), {})[(axis[1] or axis[2]).lower()] = key
+        if series != "base_quat" and (axis or _AXIS.search(re.sub(r"\s*[\[(][^\[(]*$", "", bare))):
+            like_an_imu.append(key)
     whole: dict[str, Channels] = {}
-    for series, tables in found.items():
+    for (series, _, unit), by_axis in found.items():
         columns = BASE_COLUMNS[series]
-        for by_axis in tables.values():
-            if set(by_axis) >= set(columns) and series not in whole:
-                whole[series] = Channels(names=tuple(by_axis[axis] for axis in columns))
+        if set(by_axis) >= set(columns) and series not in whole:
+            whole[series] = Channels(names=tuple(by_axis[axis] for axis in columns), unit=unit)
     if not {"base_ang_vel", "base_lin_acc"} <= set(whole):
-        return NO_BASE, []
+        return NO_BASE, [
+            f"{listed(like_an_imu, 6)}: like an IMU's, but not used; expected x, y and z of angular velocity "
+            f"({listed(BASE_UNITS['base_ang_vel'])}) and of acceleration ({listed(BASE_UNITS['base_lin_acc'])}). If "
+            "the base moves, map them: [base] in a column map."
+        ] * bool(like_an_imu)
     contact = _contacts(log)
-    said = [f"{series} from {whole[series].names[0]} …" for series in whole]
+    said = [
+        f"{series} from {each.names[0]} …{f' in {each.unit}' if each.unit else ''}" for series, each in whole.items()
+    ]
     said += [f"contact of {listed(contact, 4)}"] if contact else []
     return BaseMap(series=whole, contact=contact, foot_force={}), [f"The base moves: {', '.join(said)}."]
+
+
+def _without_unit(key: str, series: str) -> tuple[str, str]:
+    """A name without the unit at its end, and that unit; "" where it states none of ours."""
+    for unit in (unit for unit in _SPELT if unit in BASE_UNITS[series]):
+        if at := re.search(rf"(?:[ _]*[\[(] *|[ _])(?:{_SPELT[unit]}) *[\])]?$", key, re.IGNORECASE):
+            return key[: at.start()], unit
+    return key, ""
 
 
 def _contacts(log: Log) -> dict[str, str]:
@@ -167,7 +194,11 @@ def base_text(base: BaseMap) -> list[str]:
     if base.contact:
         lines += ["", "[contact]", *(f"{json.dumps(foot)} = {json.dumps(name)}" for foot, name in base.contact.items())]
     if base.foot_force:
-        lines += ["", "[foot_force]", *(f"{json.dumps(foot)} = {_entry(each)}" for foot, each in base.foot_force.items())]
+        lines += [
+            "",
+            "[foot_force]",
+            *(f"{json.dumps(foot)} = {_entry(each)}" for foot, each in base.foot_force.items()),
+        ]
     return lines
 
 

@@ -165,7 +165,7 @@ def map_text(columns: ColumnMap, comments: tuple[str, ...] = ()) -> str:
         lines += ["", "[time]"]
         lines += [f"column = {json.dumps(columns.time)}"] if columns.time else []
         lines += [f'unit = "{columns.time_unit}"'] if columns.time_unit else []
-        lines += [f"rate = {columns.rate:g}"] if columns.rate else []
+        lines += [f"rate = {columns.rate!r}"] if columns.rate else []
     lines += base_text(columns.base)
     if columns.facts:
         lines += ["", "[facts]", *(f"{key} = {_value(value)}" for key, value in columns.facts.items())]
@@ -193,7 +193,9 @@ def _left_open(sources: Mapping[str, Source]) -> list[str]:
 def _value(value: Any) -> str:
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{json.dumps(str(key))} = {_value(item)}" for key, item in value.items()) + "}"
-    return json.dumps(value)
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(_value(item) for item in value)}]"
+    return repr(value) if isinstance(value, float) else json.dumps(value)  # inf, and not Infinity
 
 
 def printable(text: str) -> str:

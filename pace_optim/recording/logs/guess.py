@@ -19,7 +19,7 @@ from pace_optim.recording.time_base import held
 from .base import guess_base
 from .column_map import ColumnMap, Source
 from .log import Channel, Log
-from .units import Known, guessed_units
+from .units import Known, guessed_units, no_slopes
 from .words import CURRENTS, GAINS, NEED_FACTOR, UNITS, is_other, joint_places, match, meaning, only_numbers
 
 _PLANNED = re.compile(r":(positions|velocities|effort|(desired|reference|output)\.\w+)\[")
@@ -83,6 +83,7 @@ class _Candidate:
     series: str
     label: str
     unit: str
+    unknown_unit: str = ""
 
 
 def guess_map(log: Log, robot: Robot, channels: Mapping[str, Channel] | None = None) -> Guess:
@@ -96,8 +97,15 @@ def guess_map(log: Log, robot: Robot, channels: Mapping[str, Channel] | None = N
     places = joint_places((channel.name for channel in log.channels.values()), robot.joint_names)
     candidates = [found for channel in log.channels.values() if (found := _candidate(channel, places)) is not None]
     if robot.joint_names:  # feet may have commands too
-        candidates = [c for c in candidates if not is_other(c.label) or _meant(c.label, robot.joint_names, robot.wanted)]
-    candidates = _once(candidates, notes)
+        candidates = [
+            c for c in candidates if not is_other(c.label) or _meant(c.label, robot.joint_names, robot.wanted)
+        ]
+    if unknown := [c for c in candidates if c.unknown_unit]:
+        notes.append(
+            f"{listed(c.channel.key for c in unknown)}: the unit is not known, so not used. Map it with a known unit "
+            'and a factor, such as unit = "N m", factor = 0.113.'
+        )
+    candidates = _once([c for c in candidates if not c.unknown_unit], notes)
     names = robot.joint_names or _own_names(candidates)
     groups: dict[tuple[str, str], list[_Candidate]] = defaultdict(list)
     for each in candidates:
@@ -203,7 +211,11 @@ def _candidate(channel: Channel, places: Mapping[str, tuple[int, int]]) -> _Cand
         label = "_".join(place or [word for word in around if word not in ("controller", "controllers", "forward")])
     commanded = said.commanded and said.quantity in MEASURED_SERIES
     return _Candidate(
-        channel=channel, series=("des_" if commanded else "") + said.quantity, label=label, unit=said.unit
+        channel=channel,
+        series=("des_" if commanded else "") + said.quantity,
+        label=label,
+        unit=said.unit,
+        unknown_unit=said.unknown_unit,
     )
 
 
@@ -387,6 +399,14 @@ def _with_units(
             known = {name: robot.known(name, stated[name], given[name]) for name in group}
             units, more = guessed_units(series, known, scaled, of_positions)
             notes += more
+        elif series == "dof_vel":
+            speeds = {name: stated[name][series] for name in group}
+            for name, ratio in no_slopes(speeds, scaled).items():
+                units[name] = ""
+                notes.append(
+                    f"{group[name].channel.key}: {ratio:.3g} times the slope of {name}'s position, so one of the two "
+                    "units is wrong: left out."
+                )
         for name, each in group.items():
             if not units[name]:
                 continue

@@ -6,7 +6,7 @@ import csv
 import os
 import shlex
 import zipfile
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -53,7 +53,11 @@ class LogReader:
     """Reads the files of one command: logs with the same columns have the same units, and are described once."""
 
     def __init__(
-        self, paths: Sequence[str], columns: ColumnMap | None = None, facts: str | os.PathLike[str] | None = None
+        self,
+        paths: Sequence[str],
+        columns: ColumnMap | None = None,
+        facts: str | os.PathLike[str] | None = None,
+        strict: bool = False,
     ):
         """Args:
         paths: All files and folders. One is a recording (.csv, .npz, .pt), a rosbag2 (.mcap, .db3, or its folder), a
@@ -61,8 +65,11 @@ class LogReader:
             by `+`.
         columns: Which column is what; without it, it is guessed.
         facts: JSON file of what is true of all recordings, where they do not state it.
+        strict: Whether an episode that cannot be used refuses its log, instead of being set aside.
         """
         self._columns = columns
+        self._strict = strict
+        self._set_aside: dict[str, list[str]] = {}
         self._facts, note = ({}, "") if facts is None else read_facts(Path(facts), known=SHARED_FACTS)
         self._note = note
         self._logs: dict[str, list[Log]] = {}
@@ -77,19 +84,33 @@ class LogReader:
     def recordings(self, path: str, robot: Robot) -> list[Recording]:
         """The recordings of a file or folder."""
         if not is_log(Path(path), self._columns):
-            return [load_recording(path, self._columns.rate if self._columns else 0.0, self._facts)]
+            return [load_recording(path, self._columns.rate if self._columns else 0.0, self._facts, robot.joint_names)]
         return [recording for recording, _ in self.understood(path, robot)]
 
     def understood(self, path: str, robot: Robot) -> list[tuple[Recording, ColumnMap]]:
         """The recordings of a log, one or one per episode, and which column was taken for what."""
         columns = self._columns
         self._readings.pop(str(Path(path)), None)
+        found: list[tuple[Recording, ColumnMap]] = []
+        faults: dict[str, ValueError] = {}
         try:
-            return [self._read(Path(path), log, robot) for log in self._logs_of(path)]
+            for log in self._logs_of(path):
+                try:
+                    found.append(self._read(Path(path), log, robot))
+                except ValueError as error:
+                    if self._strict:
+                        raise
+                    faults[log.name] = error
+            if faults and not found:
+                raise next(iter(faults.values()))
         except ValueError as error:
             if columns is None or columns.source in str(error):
                 raise
             raise ValueError(f"{error} ({Path(path).name} was read by {columns.source}.)") from None
+        self._set_aside[path] = [
+            f"warning: {name} is set aside: {' '.join(str(error).split())} [W20]" for name, error in faults.items()
+        ]
+        return found
 
     def lines(self) -> list[str]:
         """How the logs were read so far, those that were read alike together."""
@@ -101,7 +122,8 @@ class LogReader:
             else:
                 group.append(reading)
         of_facts = [f"note: {self._note}"] if self._note else []
-        return [*(line for group in alike for line in _lines(group)), *of_facts]
+        of_readings = [line for group in alike for line in _lines(group)]
+        return [*of_readings, *of_facts, *(line for lines in self._set_aside.values() for line in lines)]
 
     def _logs_of(self, path: str) -> list[Log]:
         if path not in self._logs:
@@ -399,6 +421,11 @@ def fields_of(log: Log, columns: ColumnMap, joint_names: Sequence[str]) -> tuple
         time = max(clocks, key=len)
         time = time[(time >= begin) & (time <= end)]
         notes.append("Positions of the joints were logged at different instants: put on those of one by cubics.")
+    of_column: dict[str, list[str]] = {}
+    for name in joint_names:
+        of_column.setdefault(columns.joints[name]["dof_pos"].channel, []).append(name)
+    twice = [f"{key} ({listed(those)})" for key, those in of_column.items() if len(those) > 1]
+    notes += [f"One column holds the positions of several joints: {listed(twice)}."] if twice else []
     if len(time) < 2:
         raise ValueError(f"{log.name}: the positions of {listed(joint_names)} have no time in common. Check the log.")
     first = float(time[0])
@@ -497,7 +524,11 @@ def rates_of(logs: Sequence[Log], columns: ColumnMap) -> list[str]:
     """What was understood of logs with the same columns, a line for each series: where from, unit, rate, longest gap."""
     lines = []
     for series in (*MEASURED_SERIES, *CONDITIONS, *COMMAND_SERIES):
-        by = {name: sources[series] for name, sources in columns.joints.items() if series in sources}
+        by = {
+            name: sources[series]
+            for name, sources in columns.joints.items()
+            if series in sources and sources[series].channel in logs[0].channels  # a map may have more joints
+        }
         for names, source in _alike(logs[0], by):
             channels = [log.channels[source.channel] for log in logs if source.channel in log.channels]
             gap = max(float(np.diff(each.time).max(initial=0.0)) for each in channels)

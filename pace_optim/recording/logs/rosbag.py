@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pace_actuators.memory import check_memory
+from pace_optim.recording.time_base import interpolate_linear
 
 from .log import Channel, Log, cleaned, reader
 
@@ -30,6 +31,8 @@ class _Rows:
     def __init__(self) -> None:
         self.received: list[int] = []
         self.stamped: list[int] = []
+        self.message: list[int] = []
+        self.after: list[int] = []
         self.values: list[np.ndarray] = []
 
 
@@ -45,7 +48,7 @@ def read_rosbag(path: Path) -> Log:
     count = 0
     try:
         with highlevel.AnyReader([path], default_typestore=store) as bag:
-            for connection, received, raw in bag.messages():
+            for number, (connection, received, raw) in enumerate(bag.messages()):
                 if connection.topic in unread:
                     continue
                 try:
@@ -63,6 +66,8 @@ def read_rosbag(path: Path) -> Log:
                     rows.received.append(received + after)
                     stamp = _stamp(message)
                     rows.stamped.append(stamp + after if stamp else 0)
+                    rows.message.append(number)
+                    rows.after.append(after)
                     rows.values.append(values)
     except ValueError:
         raise
@@ -92,9 +97,14 @@ def read_rosbag(path: Path) -> Log:
 def _channels(
     topic: str, groups: dict[tuple[tuple[str, str, str], ...], _Rows], use_header: bool, origin: int
 ) -> Iterator[tuple[list[Channel], list[str]]]:
+    by_joints: dict[frozenset[str], list[_Rows]] = {}
     for names, rows in groups.items():
-        time = (np.array(_times(rows, use_header), dtype=np.int64) - origin) * 1e-9
-        values = np.array(rows.values, dtype=np.float64)
+        by_joints.setdefault(frozenset(joint for _, _, joint in names), []).append(rows)
+    for names, rows in groups.items():
+        alike = by_joints[frozenset(joint for _, _, joint in names)]
+        kept = _not_replaced(rows, alike, use_header)
+        time = (np.array(_times(rows, use_header), dtype=np.int64) - origin)[kept] * 1e-9
+        values = np.array(rows.values, dtype=np.float64)[kept]
         columns = {key: values[:, i] for i, (key, _, _) in enumerate(names)}
         yield cleaned(
             topic,
@@ -103,6 +113,22 @@ def _channels(
             series={key: series for key, series, _ in names},
             joint={key: joint for key, _, joint in names},
         )
+
+
+def _not_replaced(rows: _Rows, alike: Sequence[_Rows], use_header: bool) -> np.ndarray:
+    """Which rows count, (T,) bool: a trajectory ends where a later message begins.
+
+    Args:
+        alike: Those of the same topic and joints.
+    """
+    if not any(any(each.after) for each in alike):
+        return np.ones(len(rows.values), dtype=bool)
+    message = np.concatenate([each.message for each in alike])
+    begin = np.concatenate([np.array(_times(each, use_header)) - each.after for each in alike])
+    order = np.argsort(message, kind="stable")
+    next_begin = np.append(np.minimum.accumulate(begin[order][::-1])[::-1], np.iinfo(np.int64).max)
+    later = np.searchsorted(message[order], rows.message, side="right")
+    return np.array(_times(rows, use_header)) < next_begin[later]
 
 
 def _joined(one: Channel | None, other: Channel) -> Channel:
@@ -247,8 +273,9 @@ def _trajectory(message: Any, topic: str) -> Iterator[tuple[int, Names, np.ndarr
             f"{topic}: a trajectory lasts {1e-9 * (after[-1] - after[0]):.3g} s, expected at most a day. Leave its "
             "messages out of the bag."
         )
-    for at in range(int(after[0]), int(after[-1]) + 1, _FINE):
-        yield at, tuple(names), np.array([np.interp(at, after, column) for column in table.T])
+    instants = np.append(np.arange(after[0], after[-1], _FINE), after[-1])
+    for at, values in zip(instants.tolist(), interpolate_linear(after, table, instants), strict=True):
+        yield at, tuple(names), values
 
 
 def _numbers(value: Any, place: str) -> Iterator[tuple[str, float]]:

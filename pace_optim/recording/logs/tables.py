@@ -14,6 +14,7 @@ import numpy as np
 from pace_actuators.files import parsed_json
 from pace_actuators.memory import check_memory
 from pace_actuators.text import listed
+from pace_optim.recording.checks import MIN_SAMPLES
 from pace_optim.recording.text_table import column_of, read_rows
 from pace_optim.recording.time_base import seconds_of, set_back, unix_unit, unrounded
 from pace_optim.terminal.arrays import read_arrays
@@ -147,9 +148,10 @@ def _unfolded(name: str, column: Any, names: tuple[str, ...]) -> Iterator[tuple[
             yield name, values if values.dtype.kind in "iuf" else values.astype(np.float64)
         return
     rows = column.to_pylist()
-    length = next((len(row) for row in rows if row is not None), 0)
-    if not length or not isinstance(rows[0], list) or isinstance(rows[0][0], (list, str)):
+    first = next((row for row in rows if row), None)
+    if not isinstance(first, list) or isinstance(first[0], (list, str)):
         return
+    length = len(first)
     values = np.array(
         [row if row is not None and len(row) == length else [np.nan] * length for row in rows], dtype=float
     )
@@ -232,7 +234,12 @@ def _logs(
     parts = [slice(a, b) for a, b in zip([0, *back], [*back, len(time)], strict=True)]
     if len(back):
         jumps = [f"by {time[k - 1] - time[k]:.4g} s after row {k} ({time[k - 1] - time[0]:.4g} s)" for k in back]
-        notes.append(f"The clock goes back {listed(jumps, 4)}: read as {len(parts)} recordings.")
+        short = [rows for rows in parts if rows.stop - rows.start < MIN_SAMPLES]
+        parts = [rows for rows in parts if rows not in short] or parts
+        left = f" Parts of fewer than {MIN_SAMPLES} rows are left out." if 0 < len(short) <= len(back) else ""
+        notes.append(
+            f"The clock goes back {listed(jumps, 4)}: read as {len(parts)} recording{'s' * (len(parts) > 1)}.{left}"
+        )
     logs = []
     for number, rows in enumerate(parts, start=1):
         stamps, rounding = time[rows], ""
@@ -269,8 +276,9 @@ def _time(
         best = max(usable, key=lambda name: _share_rising(columns[name]))
         unit = (chosen.time_unit if chosen else "") or ("ns" if best in joined else time_unit(best))
         time, origin, note = _seconds(path, best, columns[best], unit)
-        others = [name for name in usable if name != best]
-        return best, time, origin, " ".join([note, *(_beside(best, time, name, columns[name]) for name in others)])
+        others = [_beside(best, time, name, columns[name]) for name in usable if name != best]
+        others += [f"The rate of {chosen.rate:g} Hz is not used."] if chosen and chosen.rate else []
+        return best, time, origin, " ".join([note, *others])
     if chosen and chosen.rate:
         count = len(next(iter(columns.values())))
         return "", np.arange(count) / chosen.rate, 0.0, f"Time is the row's number at the stated {chosen.rate:g} Hz."

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy import signal
+from scipy.integrate import cumulative_trapezoid
 
 from pace_actuators.joint_units import JointType, units_for
 from pace_actuators.text import listed
@@ -30,6 +32,8 @@ _STILL = 0.05
 """Positions within this are of a joint that stands: they say the same in degrees [rad]."""
 _CLEAR = 3.0
 """How many times nearer one unit must be than the other, to be it."""
+_WRONG = 5.0
+"""Times its position's slope, or part of it, that a speed with a stated unit is not."""
 _MOVES = 0.05
 """Root mean square of a slope that a speed can be held against [rad/s]."""
 
@@ -79,9 +83,12 @@ def _of_positions(
     known: Mapping[str, Known], channels: Mapping[str, Channel], joint_type: JointType
 ) -> tuple[dict[str, str], list[str]]:
     """Speeds and torques in known units decide. Else positions are in the smaller unit if the other one is impossible
-    on half of the joints that say anything, and the smaller one on no joint."""
+    on half of the joints that say anything, and the smaller one on no joint.
+    """
     whole, small = _POSITIONS[joint_type]
-    shown = [by for joint in known.values() if (by := _by_speeds(joint, whole, small) or _by_gains(joint, whole, small))]
+    shown = [
+        by for joint in known.values() if (by := _by_speeds(joint, whole, small) or _by_gains(joint, whole, small))
+    ]
     far = [name for name, joint in known.items() if _is_impossible(joint, whole, joint_type)]
     saying = [name for name, channel in channels.items() if name in far or np.ptp(channel.values) > _STILL]
     unit = whole
@@ -186,9 +193,7 @@ def _of_speeds(
             if np.mean(slope**2) > _MOVES**2:
                 ratios[name] = max(float(slope @ speed / (slope @ slope)), 1e-9)
     usual = float(np.median(np.log(list(ratios.values())))) if ratios else 0.0
-    away = {
-        unit: abs(usual + np.log(factor)) for unit, factor in UNITS["dof_vel"].items() if ("m/s" in unit) == slides
-    }
+    away = {unit: abs(usual + np.log(factor)) for unit, factor in UNITS["dof_vel"].items() if ("m/s" in unit) == slides}
     unit = min(away, key=lambda unit: away[unit])
     if series == "des_dof_vel":
         units = dict.fromkeys(channels, whole if away[whole] < 1.0 or away[unit] > 0.5 else unit)
@@ -206,6 +211,32 @@ def _of_speeds(
         ratios_of = listed(f"{name} ({ratio:.3g})" for name, ratio in strange.items())
         notes.append(f"Speeds are no slopes of positions in any known unit: left out. Times the slope: {ratios_of}.")
     return units, notes
+
+
+def no_slopes(speeds: Mapping[str, Channel], positions: Mapping[str, Channel]) -> dict[str, float]:
+    """How many times the slope of its position a speed is, of joints where that is far from 1.
+
+    The speed's integral is held against the position: an encoder's noise counts little there.
+
+    Args:
+        speeds: By joint, in SI units.
+        positions: By joint, in SI units.
+    """
+    result = {}
+    for name, channel in speeds.items():
+        position = positions.get(name)
+        if position is None or len(position.time) < 3:
+            continue
+        there = np.interp(position.time, channel.time, channel.values)
+        moved, reached = (
+            signal.detrend(each) for each in (cumulative_trapezoid(there, position.time, initial=0.0), position.values)
+        )
+        if np.std(reached) < _STILL:
+            continue
+        ratio = float(moved @ reached / (reached @ reached))
+        if not 1 / _WRONG < ratio < _WRONG:
+            result[name] = ratio
+    return result
 
 
 def _of_efforts(

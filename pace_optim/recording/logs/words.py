@@ -14,14 +14,16 @@ TEMPERATURE, VOLTAGE = "temperature", "voltage"
 
 UNITS: dict[str, dict[str, float]] = {
     POSITION: {
-        "rad": 1.0, "deg": np.pi / 180, "mrad": 1e-3, "turn": 2 * np.pi, "m": 1.0, "cm": 1e-2, "mm": 1e-3,
+        "rad": 1.0, "deg": np.pi / 180, "mrad": 1e-3, "mdeg": np.pi / 180e3, "cdeg": np.pi / 18e3,
+        "turn": 2 * np.pi, "m": 1.0, "cm": 1e-2, "mm": 1e-3,
     },
     VELOCITY: {
-        "rad/s": 1.0, "deg/s": np.pi / 180, "rpm": np.pi / 30, "turn/s": 2 * np.pi, "m/s": 1.0, "cm/s": 1e-2,
-        "mm/s": 1e-3,
+        "rad/s": 1.0, "deg/s": np.pi / 180, "rpm": np.pi / 30, "turn/s": 2 * np.pi, "mrad/s": 1e-3,
+        "mdeg/s": np.pi / 180e3, "cdeg/s": np.pi / 18e3, "m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3,
     },
     EFFORT: {
-        "N m": 1.0, "mN m": 1e-3, "N": 1.0, "kN": 1e3, "A": 1.0, "mA": 1e-3, "%": 1e-2, "permille": 1e-3,
+        "N m": 1.0, "mN m": 1e-3, "N cm": 1e-2, "N mm": 1e-3, "kN m": 1e3, "kgf cm": 9.80665e-2, "N": 1.0, "kN": 1e3,
+        "A": 1.0, "mA": 1e-3, "%": 1e-2, "permille": 1e-3,
     },
     TEMPERATURE: {"°C": 1.0, "0.1 °C": 0.1},
     VOLTAGE: {"V": 1.0, "0.1 V": 0.1, "mV": 1e-3},
@@ -93,24 +95,37 @@ _NOT_OF_DRIVES = {"ambient", "room", "air", "cpu", "gpu", "board", "mcu", "ntc",
 """Words of temperatures and voltages of other things than drives."""
 _GENERIC = {"joint", "joints", "j", "motor", "motors", "dof", "actuator", "servo", "axis", "drive", "link", "data"}
 _SIDES = {"l": "left", "r": "right"}
+PER_S = r"[ _]?(/|per)[ _]?s(ec(onds?)?)?"
+_DOT = r"[ _.·⋅*-]?"
 _UNIT_PATTERNS: tuple[tuple[str, str, str], ...] = (
     (r"°c\b|\bdeg(rees?)?[ _]?c(elsius)?\b|\bcelsius\b|[\[(]c[\])]", TEMPERATURE, "°C"),
     (r"\bmv\b|millivolts?", VOLTAGE, "mV"),
     (r"[\[(]v[\])]", VOLTAGE, "V"),
-    (r"deg(rees?)?[ _]?(/|per)[ _]?s(ec)?|deg_s\b|dps\b|°/s", VELOCITY, "deg/s"),
-    (r"m?rad(ians?)?[ _]?(/|per)[ _]?s(ec)?|rad_s\b", VELOCITY, "rad/s"),
+    (rf"(?<![a-z])mdeg{PER_S}|(?<![a-z])mdeg_s\b", VELOCITY, "mdeg/s"),
+    (rf"(?<![a-z])cdeg{PER_S}|(?<![a-z])cdeg_s\b", VELOCITY, "cdeg/s"),
+    (rf"(?<![a-z])mrad{PER_S}|(?<![a-z])mrad_s\b", VELOCITY, "mrad/s"),
+    (rf"(?<![mcd])deg(rees?)?{PER_S}|(?<![mcd])deg_s\b|dps\b|(?<!m)°/s(ec)?", VELOCITY, "deg/s"),
+    (rf"(?<![mcg])rad(ians?)?{PER_S}|(?<![mcg])rad_s\b", VELOCITY, "rad/s"),
     (r"\brpm\b", VELOCITY, "rpm"),
-    (r"(rev|turns?)[ _]?(/|per)[ _]?s(ec)?|rps\b", VELOCITY, "turn/s"),
-    (r"\bmm[ _]?(/|per)[ _]?s(ec)?\b|mm_s\b", VELOCITY, "mm/s"),
-    (r"\bcm[ _]?(/|per)[ _]?s(ec)?\b|cm_s\b", VELOCITY, "cm/s"),
-    (r"\bm[ _]?(/|per)[ _]?s(ec)?\b|[ _]m_s\b", VELOCITY, "m/s"),
+    (rf"(rev|turns?){PER_S}|rps\b", VELOCITY, "turn/s"),
+    (rf"\bmm{PER_S}\b|mm_s\b", VELOCITY, "mm/s"),
+    (rf"\bcm{PER_S}\b|cm_s\b", VELOCITY, "cm/s"),
+    (rf"\bm{PER_S}\b|[ _]m_s\b", VELOCITY, "m/s"),
     (r"‰|\bper[ _]?mille?\b", EFFORT, "permille"),
     (r"%|\bpercent\b|\bpct\b", EFFORT, "%"),
-    (r"\bmn[ _.·*]?m\b", EFFORT, "mN m"),
-    (r"\bn[ _.·*]?m\b", EFFORT, "N m"),
+    (rf"\bmn{_DOT}m\b", EFFORT, "mN m"),
+    (rf"\bn{_DOT}cm\b", EFFORT, "N cm"),
+    (rf"\bn{_DOT}mm\b", EFFORT, "N mm"),
+    (rf"\bkn{_DOT}m\b", EFFORT, "kN m"),
+    (rf"\bkgf?{_DOT}cm\b", EFFORT, "kgf cm"),
+    (rf"\bn{_DOT}m\b", EFFORT, "N m"),
+    (r"[\[(]kn[\])]", EFFORT, "kN"),
+    (r"[\[(]n[\])]", EFFORT, "N"),
     (r"\bma\b|milliamps?", EFFORT, "mA"),
     (r"\bamps?\b|\bamperes?\b|[\[( ]a[\]) ]|[ _]a$", EFFORT, "A"),
     (r"\bmrad\b", POSITION, "mrad"),
+    (r"\bmdeg\b", POSITION, "mdeg"),
+    (r"\bcdeg\b", POSITION, "cdeg"),
     (r"\bdeg(rees?)?\b|°", POSITION, "deg"),
     (r"\brad(ians?)?\b", POSITION, "rad"),
     (r"\b(turns?|revs?|revolutions?)\b", POSITION, "turn"),
@@ -121,9 +136,23 @@ _UNIT_PATTERNS: tuple[tuple[str, str, str], ...] = (
 _UNIT_WORDS = {
     "deg", "degree", "degrees", "rad", "radian", "radians", "rpm", "nm", "mnm", "ms", "us", "ns", "ma", "turn",
     "turns", "rev", "dps", "per", "sec", "mrad", "rps", "mm", "cm", "percent", "pct", "mille", "permille",
+    "mdeg", "cdeg", "ncm", "nmm", "knm", "kn", "kgcm", "kgfcm",
 }  # fmt: skip
 """Not the letters n, m, s and a, which name joints (A1): they are units only where a pattern above says so."""
 
+
+_BRACKET = re.compile(r"[\[(]\s*([^\[(\])]*?)\s*[\])]\s*$")
+_SYMBOL = (
+    r"(?:1/s(?:ec)?|1/min|(?:da|[mµuk])?n(?:mm|cm|dm|m)?|(?:kgf?|gf?)(?:mm|cm|m)|oz(?:in)?|in(?:lbf?)?|inch(?:es)?|"
+    r"lbf?(?:in|ft)?|f(?:oo)?t(?:lbf?)?|"
+    r"[mcdµuk]?m|[mcdµu]?rad|[mcdµu]?deg|[mcdµu]?°|[mcdµu]?degrees?|g(?:rad|on)|turns?|rev(?:s|olutions?)?|"
+    r"ticks?|counts?|cnts?|inc(?:rements?)?|lsb|steps?|pulses?|bits?|raw|digits?|[mk]?a|[mk]?v|[mk]?hz|rpm|dps|rps|"
+    r"°c|°f|deg ?[cf]|[cfk]|%|‰|[mµun]?s|sec|min|h|[mk]?g|kgf|gf|ozf?|[mk]?w|[mk]?j)"
+)
+_LIKE_A_UNIT = re.compile(
+    rf"(?:\d+(?:\.\d+)?(?:e-?\d+)? ?)?{_SYMBOL}(?:[ _.·⋅*/-]{{1,2}}{_SYMBOL}|\^-?[123]|[²³]|(?<=/s)2)*"
+)
+"""What stands in brackets behind a name and is a unit, known or not: no joint's name or number."""
 
 _SEAMS = re.compile(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])|(?<=[A-Za-z])(?=\d)|(?<=\d)(?=[A-Za-z])")
 """Where a word ends inside of a name without separators."""
@@ -143,6 +172,8 @@ class Meaning:
     unit: str
     joint: tuple[str, ...]
     """Words of the joint's name."""
+    unknown_unit: str = ""
+    """A unit that the name states and that is not known."""
 
 
 def words(name: str) -> list[str]:
@@ -180,7 +211,9 @@ def meaning(name: str, table: str = "", joint: tuple[int, int] | None = None) ->
     whole = name
     if joint is not None:
         name = f"{whole[: joint[0]]} {whole[joint[1] :]}"
-    unit, of_unit, without_unit = _unit(name)
+    unknown = _unknown_unit(name)
+    unit, of_unit, without_unit = ("", "", _BRACKET.sub("", name)) if unknown else _unit(name)
+    name = without_unit if unknown else name
     own, around = words(name), words(table)
     said = set(own)
     current = (
@@ -228,7 +261,7 @@ def meaning(name: str, table: str = "", joint: tuple[int, int] | None = None) ->
     if not unit and quantity == EFFORT and said & _EFFORT == {"load"}:
         unit, of_unit = "%", EFFORT  # a servo's register, of a duty or of its largest torque
     unit = unit if of_unit in ("", quantity) else ""
-    return Meaning(quantity=quantity, commanded=commanded, unit=unit, joint=tuple(label))
+    return Meaning(quantity=quantity, commanded=commanded, unit=unit, joint=tuple(label), unknown_unit=unknown)
 
 
 def joint_places(columns: Iterable[str], joint_names: Sequence[str] = ()) -> dict[str, tuple[int, int]]:
@@ -244,7 +277,7 @@ def joint_places(columns: Iterable[str], joint_names: Sequence[str] = ()) -> dic
     splits: dict[str, list[_Split]] = {}
     nameless = False
     for column in columns:
-        placed = _placed(column)
+        placed = _placed(_BRACKET.sub("", column) if _unknown_unit(column) else column)
         own = tuple(word for word, _, _ in placed)
         nameless |= set(own) <= _SERIES
         if at := next((at for name in of_robot if (at := _where(own, name))), None):
@@ -284,7 +317,8 @@ class _Split:
             return False
         ends = {self.joint[0], self.joint[-1]}
         return bool(said & _POSITION) or (
-            bool(said & _MEASURED - {"current"}) and not ends & (_POSITION | _VELOCITY | _EFFORT | _AMPERES | {"current"})
+            bool(said & _MEASURED - {"current"})
+            and not ends & (_POSITION | _VELOCITY | _EFFORT | _AMPERES | {"current"})
         )
 
 
@@ -339,6 +373,18 @@ def _of_table(said: set[str], around: set[str]) -> str:
         if every & names:
             return quantity
     return POSITION if every & _NO_QUANTITY else ""
+
+
+def _unknown_unit(name: str) -> str:
+    """The unit in brackets at the end of a name, where no pattern is all of it."""
+    bracket = _BRACKET.search(name)
+    if bracket is None or not _LIKE_A_UNIT.fullmatch(bracket[1].lower()):
+        return ""
+    if len(bracket[1]) == 1 and not set(words(name)) & set(_CONDITIONS):
+        return ""  # a letter may name a joint
+    text = f"[{bracket[1].lower()}]"
+    known = any(re.search(rf"^\[?(?:{pattern})\]?$", text) for pattern, _, _ in _UNIT_PATTERNS)
+    return "" if known else bracket[1]
 
 
 def _unit(name: str) -> tuple[str, str, str]:

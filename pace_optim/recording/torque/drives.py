@@ -59,9 +59,12 @@ class MeasuredDrives:
         for fact in facts:
             for joint in self.taken.get(fact, ()) if fact in factors else ():
                 laws = self.laws[joint].values()
-                off = max(law.std[fact] / abs(getattr(law, fact)) for law in laws if getattr(law, fact))
+                known = [law for law in laws if fact in law.std and getattr(law, fact)]
+                off = max((law.std[fact] / abs(getattr(law, fact)) for law in known), default=0.0)
                 width = min(max(SURE * off, _LEAST_ROOM), _MOST_ROOM)
-                bounds = (1 / _ROOM_WITH_SCALE, 1.0, _ROOM_WITH_SCALE) if sensed else (1 - width, 1.0, 1 + width)
+                bounds = (
+                    (1 / _ROOM_WITH_SCALE, 1.0, _ROOM_WITH_SCALE) if joint in sensed else (1 - width, 1.0, 1 + width)
+                )
                 result.setdefault(factors[fact], {})[joint] = bounds
         return result
 
@@ -259,9 +262,9 @@ def _line_of_joint(laws: Sequence[MeasuredLaw], control_dt: float, joint_type: J
             f"{joint}: dof_effort is not the torque of a PD law of its error (R² {best:.2g}): nothing is read from it."
         )
     parts = [
-        f"kp {_values(good, 'stiffness')} N m/rad" if "stiffness" in good[0].std else "",
-        f"kd {_values(good, 'damping')} N m s/rad" if "damping" in good[0].std else "",
-        f"feed-forward {_values(good, 'feed_forward')}" if good[0].feed_forward is not None else "",
+        f"kp {kp} N m/rad" if (kp := _values(good, "stiffness")) else "",
+        f"kd {kd} N m s/rad" if (kd := _values(good, "damping")) else "",
+        f"feed-forward {part}" if (part := _values(good, "feed_forward")) else "",
         f"constant {_values(good, 'offset')} N m" if any(has_offset(law) for law in good) else "",
         f"delay {_range([1e3 * control_dt * law.delay for law in good])} ms",
         _limit(good),
@@ -309,9 +312,11 @@ def _unit_between(ratio: float) -> str:
 
 
 def _values(laws: Sequence[MeasuredLaw], field: str) -> str:
-    """A value with its error, or from the smallest to the largest of several recordings."""
-    values = [getattr(law, field) for law in laws]
-    text = _range(values)
+    """A value with its error, or from the smallest to the largest of several recordings; "" where no law has it."""
+    laws = [law for law in laws if field in law.std]
+    if not laws:
+        return ""
+    text = _range([getattr(law, field) for law in laws])
     return text if " to " in text else f"{text} ± {max(law.std[field] for law in laws):.1g}"
 
 

@@ -136,7 +136,7 @@ class Table:
 
 def _held(stamps: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Commands as they are in force at some times."""
-    return held(stamps, values, at + _TOLERANCE * float(stamps[1] - stamps[0]))
+    return held(stamps, values, at + _TOLERANCE * float(np.ptp(stamps[:2])))
 
 
 def _commands(recording: Recording, j: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:

@@ -144,6 +144,13 @@ def test_noise_has_the_level_asked_for():
     assert error.std(axis=0) == pytest.approx(1e-3, rel=0.02) and np.abs(error.mean(axis=0)).max() < 3e-5
 
 
+def test_a_slides_encoder_has_steps_of_a_tenth():
+    encoder = Encoder(noise=0.0, bits=12, rng=np.random.default_rng(0), radians=(1.0, 0.1))
+    read = encoder.read(np.random.default_rng(1).random((4000, 2)))
+    step = [float(np.diff(np.unique(column)).min()) for column in read.T]
+    assert step == pytest.approx([2 * np.pi / 4096, 0.2 * np.pi / 4096])
+
+
 def test_a_recording_is_as_noisy_as_asked_for(tmp_path):
     options = (*BENCH, "--duration", "2", "--no_plot")
     exact, noisy = record(tmp_path, *options), record(tmp_path, *options, "--noise", "1e-3")

@@ -8,8 +8,9 @@ import pytest
 from models import HEAD, KD, KP, MOTORS
 
 from pace_optim.identification.fit import fit
-from pace_optim.recording import Drive, Recording, save_recording
+from pace_optim.recording import Drive, Recording, conform_recording, save_recording
 from pace_optim.recording.commands import command_interval, command_timing
+from pace_optim.recording.torque.law import read_law
 from pace_optim.run.open import open_problem, problem_of
 from pace_optim.run.settings import FitSettings
 
@@ -44,6 +45,28 @@ def test_a_command_that_is_repeated_is_none(repeat, own_clock, interval):
         clock = {"des_time": time, "time": time[::4], "dof_pos": held[::4]}
     recording = Recording(name="r", joint_names=("j",), des_dof_pos=held, **clock)
     assert command_interval(recording) == pytest.approx(interval, rel=1e-9)
+
+
+def test_joints_whose_clocks_are_shifted_have_the_interval_of_one_joint():
+    des_time = np.sort(np.concatenate([0.01 * np.arange(200), 0.01 * np.arange(200) + 0.0005]))
+    first, second = 0.01 * (des_time // 0.01), 0.01 * ((des_time + 0.0095) // 0.01)
+    time = np.arange(400) * 0.005
+    recording = Recording(
+        name="r", joint_names=("a", "b"), time=time, dof_pos=np.zeros((400, 2)), des_time=des_time,
+        des_dof_pos=np.sin(np.stack([first, second], axis=1)),
+    )  # fmt: skip
+    assert command_interval(recording) == pytest.approx(0.01)
+
+
+def test_a_log_with_one_command_has_the_interval_of_its_samples():
+    time = np.arange(400) * 0.005
+    recording = Recording(
+        name="r", joint_names=("a",), time=time, dof_pos=0.3 * np.exp(-time)[:, None], des_time=time[:1],
+        des_dof_pos=np.zeros((1, 1)), dof_effort=np.sin(9 * time)[:, None],
+    )  # fmt: skip
+    conformed = conform_recording(recording, joint_order=("a",), control_dt=0.005)
+    assert conformed.command_dt == pytest.approx(0.005) and np.all(conformed.command == 0.0)
+    read_law(conformed, 0, 2.0)
 
 
 def test_jitter_and_lost_commands_are_those_of_the_stamps():

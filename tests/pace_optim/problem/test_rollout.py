@@ -23,6 +23,7 @@ from problems import record as recorded
 
 from pace_envs import set_physics_dt
 from pace_optim.estimate.cmaes_optimizer import CMAESOptimizer, CMAESOptimizerCfg
+from pace_optim.problem import evaluator
 from pace_optim.problem.rollout import Rollout
 from pace_optim.recording import Drive, Load
 from pace_optim.recording.time_base import interpolate_smooth
@@ -40,6 +41,19 @@ def record(target=None, *facts, **more):
 def scores(problem, *truths, where=None):
     vectors = torch.stack([physical(problem, truth) for truth in truths])
     return problem.evaluator().residuals(vectors, where).score
+
+
+def test_candidates_that_are_simulated_in_parts_keep_their_own_priors(monkeypatch):
+    problem = make_problem(record())
+    problem.space.prior[:] = 0.5
+    candidates = torch.stack(
+        [physical(problem), *problem.space.to_physical(torch.eye(problem.space.size))[:2].double()]
+    )
+    whole = problem.evaluator().residuals(candidates)
+    monkeypatch.setattr(evaluator, "_WIDEST", 2)
+    parts = problem.evaluator().residuals(candidates)
+    assert torch.equal(parts.prior.x, whole.prior.x)
+    assert torch.allclose(parts.score, whole.score, rtol=1e-12, atol=0.0)
 
 
 @pytest.mark.parametrize("delay_mode", ["command", "effort"])

@@ -8,10 +8,13 @@ import pytest
 from bench_recordings import Bench, chirp, record
 
 from pace_actuators import PaceDCMotorCfg
+from pace_actuators.identified import DRIVE_FIELDS
 from pace_optim.comparison.drive_loads import drive_loads
 from pace_optim.identification.fit import fit
+from pace_optim.problem.drive_facts import asked_torque, in_force
 from pace_optim.problem.problem import load_problem
 from pace_optim.problem.unknown_facts import identified_gains, started_from, with_identified
+from pace_optim.recording import Drive, Recording, conform_recording, save_recording
 from pace_optim.run.open import open_problem
 from pace_optim.run.settings import FitSettings
 
@@ -106,6 +109,48 @@ def test_an_unknown_limit_is_sought_about_the_stated_one_which_no_longer_acts(tm
     (drive,) = env.scene["robot"].actuators.values()
     assert drive.effort_limit.isinf().all()
     env.close()
+
+
+def test_an_unknown_limit_is_sought_in_a_log_whose_samples_lie_beside_the_grid(tmp_path):
+    time = np.arange(400) / 187
+    recording = Recording(
+        name="r", joint_names=("servo",), time=time, dof_pos=0.3 * np.sin(5 * time)[:, None],
+        des_dof_pos=0.4 * np.sin(5 * time)[:, None], des_dof_vel=2.0 * np.cos(5 * time)[:, None],
+        drive=Drive(stiffness=np.array([40.0]), damping=np.array([1.0]), effort_limit=np.array([10.0])),
+    )  # fmt: skip
+    path = save_recording(tmp_path / "r.npz", recording)
+    problem = load_problem(BENCH, data=[path], unknown=["effort_limit"], tell=lambda _: None)
+    assert problem.dataset.recordings[0].sample_at is not None
+    where = problem.space["torque_limit.effort"]
+    start = problem.space.to_physical(problem.space.start)[where]
+    assert float(start) == pytest.approx(0.7 * np.hypot(4.0, 0.5), rel=0.05)
+
+
+def test_an_unknown_limit_of_a_torque_log_is_sought_about_the_torques_that_were_commanded(tmp_path):
+    time = np.arange(400) * 0.0025
+    recording = Recording(
+        name="r", joint_names=("servo",), time=time, dof_pos=3.0 * np.sin(5 * time)[:, None],
+        des_dof_effort=np.sin(9 * time)[:, None], drive=Drive(effort_limit=np.array([2.0])),
+    )  # fmt: skip
+    path = save_recording(tmp_path / "r.npz", recording)
+    problem = load_problem(BENCH, data=[path], unknown=["effort_limit"], tell=lambda _: None)
+    start = problem.space.to_physical(problem.space.start)[problem.space["torque_limit.effort"]]
+    assert float(start) == pytest.approx(0.7, rel=0.05)
+
+
+def test_loops_that_do_not_act_ask_for_nothing():
+    time = np.arange(400) * 0.0025
+    torque, position = np.sin(9 * time)[:, None], 0.3 * np.sin(5 * time)[:, None]
+    configured = dict.fromkeys(DRIVE_FIELDS, np.array([40.0]))
+    effort = Recording(name="r", joint_names=("j",), time=time, dof_pos=position, des_dof_effort=torque)
+    effort = conform_recording(effort, joint_order=("j",), control_dt=0.0025)
+    assert np.array_equal(asked_torque(in_force(configured, effort), effort), torque)
+    braked = replace(effort, drive=Drive(damping=np.array([2.0])))
+    speed = np.gradient(position, time, axis=0)
+    assert asked_torque(in_force(configured, braked), braked, speed) == pytest.approx(torque - 2.0 * speed)
+    driven = replace(effort, des_dof_pos=position, command=position + 0.1)
+    asked = asked_torque(in_force(configured, driven), driven, speed, clip=False)
+    assert asked == pytest.approx(40 * 0.1 - 40 * speed + torque)
 
 
 def test_a_limit_that_was_found_is_that_of_the_drive(tmp_path):

@@ -323,6 +323,14 @@ def test_a_leg_that_stands_throughout_is_named(tmp_path):
     assert any("rr_hip, rr_knee: always held by the ground" in note for note in problem.dataset.recordings[0].notes)
 
 
+def test_legs_on_which_no_foot_is_named_are(tmp_path):
+    simulated = crawler(1).simulate(1.0)
+    problem, _ = walking_problem(
+        tmp_path, duration=1.0, contact=simulated["contact"][:, :3], feet=simulated["feet"][:3]
+    )
+    assert any("No foot is on the legs or arms of rr_hip" in note for note in problem.dataset.recordings[0].notes)
+
+
 @pytest.mark.parametrize(("duration", "turns"), [(1.0, 1), (12.0, 3)])
 def test_a_walk_is_trained_and_validated_on_in_turns(duration, turns):
     walk = conform(recording(DT * np.arange(round(duration / DT))))

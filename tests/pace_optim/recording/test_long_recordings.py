@@ -1,5 +1,7 @@
 """Recordings too long to fit are cut to the parts that move the joints most; what was left out is told."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from problems import BENCH, TRUTH, chirp, env_cfg, record, replayed
@@ -54,6 +56,11 @@ def test_what_can_be_afforded_stays_whole():
     (kept,), (other,) = affordable([[whole], [whole]], DT, 9, 4, None, told.append)
     assert kept is whole and other is whole and told == []
     assert affordable([[whole]], DT, 9, 4, 80.0, told.append)[0][0] is whole
+
+
+def test_a_whole_part_between_gaps_is_not_said_to_be_cut():
+    whole, told = replace(joint_by_joint(seconds=8.0), part_of="log", notes=("2001 samples.",)), []
+    assert affordable([[whole]], 0.0025, 9, 1, None, told.append) == [[whole]] and not told
 
 
 def test_too_many_derivatives_and_too_little_memory(monkeypatch):

@@ -412,6 +412,18 @@ def test_a_stated_unit_keeps_one_joint_beyond_its_limit_and_not_all(tmp_path):
         conform(replace(stated, dof_pos=recording().dof_pos + 3.0), joint_pos_limits=LIMITS)
 
 
+@pytest.mark.parametrize("joint_type", ["hinge", "slide"])
+def test_a_slide_may_pass_its_limit_by_a_tenth_of_what_a_hinge_may(joint_type):
+    limits = np.stack([recording().dof_pos.min(axis=0), recording().dof_pos.max(axis=0)], axis=1)
+    moved = recording(dof_pos=recording().dof_pos + 0.05, des_dof_pos=recording().des_dof_pos + 0.05)
+    arguments = {"joint_pos_limits": limits, "joint_types": (joint_type,) * 3}
+    if joint_type == "hinge":
+        conform(moved, **arguments)
+    else:
+        with pytest.raises(ValueError, match=r"the joint's limits \(and at most 0.02 beyond\)"):
+            conform(moved, **arguments)
+
+
 def test_a_multi_turn_joint_without_limits_is_noted_not_refused():
     notes = conform(recording(dof_pos=recording().dof_pos * DEGREES)).notes
     assert any("If they look like degrees" in note for note in notes)

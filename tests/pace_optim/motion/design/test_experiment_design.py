@@ -123,6 +123,20 @@ def test_each_tree_takes_its_own_best(tmp_path):
     assert np.array_equal(chosen.trajectory.des_dof_pos, again.trajectory.des_dof_pos)
 
 
+def test_a_joint_without_amplitude_rests_while_the_other_is_optimised(tmp_path):
+    cfg = pendulums_cfg(tmp_path)
+    cfg.sim2real.excitation = ExcitationCfg(bias=(0.0, 0.0), direction=(1.0, 1.0), scale=(0.3, 0.0))
+    limits = MotionLimits(
+        joint_names=("left", "right"),
+        position=np.tile([-np.inf, np.inf], (2, 1)),
+        velocity=np.full(2, 9.0),
+        effort=np.full(2, 50.0),
+    )
+    truth = {"armature": 0.1, "viscous_friction": 2.0, "friction": 0.3, "encoder_bias": 0.01, "delay": 2.6}
+    chosen = design(cfg, limits, truth=truth, settings=replace(SMALL, reach=1.5))
+    assert np.ptp(chosen.trajectory.des_dof_pos[:, 1]) == 0.0 < np.ptp(chosen.trajectory.des_dof_pos[:, 0])
+
+
 def test_a_tiny_motion_around_one_pose_confounds_bias_and_friction_and_the_optimised_one_parts_them():
     """2 mrad at 0.8 rad: the arm sags once and then stays within friction, so gravity (which knows the bias) and
     friction are seen only as a sum."""

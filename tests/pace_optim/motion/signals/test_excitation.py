@@ -1,6 +1,7 @@
 """Excitations: closed forms, ranges, smooth starts, reproducibility; and the check of a motion against a robot."""
 
 import csv
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -119,6 +120,11 @@ def test_ramp_moves_at_the_same_slow_speed_up_and_down(duration):
     assert np.abs(speed).max() <= 0.15 + 1e-9
     for column in np.sign(speed.round(6)).T:
         assert 0.3 < (column > 0).mean() < 0.7
+
+
+def test_a_ramp_of_a_slide_has_a_tenth_of_the_speed():
+    (ramp,) = make("ramp", replace(robot(scale=(0.25, 0.2)), slide_joints=("knee",)), duration=60.0)
+    assert np.median(np.abs(np.diff(ramp.des_dof_pos, axis=0)), axis=0) / DT == pytest.approx([0.15, 0.015])
 
 
 def test_multisine_excites_odd_lines_alone_and_repeats():

@@ -86,6 +86,18 @@ def test_a_recording_of_ours_takes_the_gains_too(tmp_path):
     assert found.drive.damping.tolist() == [0.1, 0.2] and load_recording(path).drive.damping is None
 
 
+def test_a_recording_of_ours_may_lack_joints_that_have_gains(tmp_path):
+    motion = np.sin(3 * TIME)[:, None] * [1, 1]
+    np.savez(tmp_path / "own.npz", time=TIME, dof_pos=motion, des_dof_pos=motion, joint_names=np.array(JOINTS))
+    path = str(tmp_path / "own.npz")
+    facts = facts_of(tmp_path, {"stiffness": {name: 1.0 for name in (*JOINTS, "wrist")}})
+    robot = Robot(joint_names=(*JOINTS, "wrist"))
+    (recording,) = LogReader([path], facts=facts).recordings(path, robot)
+    assert recording.drive.stiffness.tolist() == [1.0] * len(JOINTS)
+    with pytest.raises(ValueError, match="wrist"):
+        LogReader([path], facts=facts).recordings(path, Robot(joint_names=JOINTS))
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [
@@ -121,7 +133,9 @@ def test_a_refusal_names_the_columns_that_were_not_used(tmp_path):
     facts_of(tmp_path, {"stiffness": {"thumb_q1": 1.0, "ring": 1.0}}, "one.json")
     robot = Robot(joint_names=("thumb_q1", "ring"))
     reader = LogReader([path])
-    with pytest.raises(ValueError, match=r"joint 'ring'.* Columns of the log: not used: ring_error_pos, ring_error_cmd"):
+    with pytest.raises(
+        ValueError, match=r"joint 'ring'.* Columns of the log: not used: ring_error_pos, ring_error_cmd"
+    ):
         reader.recordings(path, robot)
     assert reader.lines()[0] == f"{path}: read as"  # is told before the refusal
 

@@ -15,7 +15,8 @@ from recordings import says
 
 from pace_optim.commands import import_log
 from pace_optim.recording import load_recording, save_recording
-from pace_optim.recording.logs import Robot, paired_files, read_map, tables, write_map
+from pace_optim.recording.logs import LogReader, Robot, paired_files, read_map, tables, write_map
+from pace_optim.recording.logs.column_map import ColumnMap, Source
 from pace_optim.recording.logs.rosbag import rows_of
 from pace_optim.recording.logs.words import meaning
 from pace_optim.terminal.cli import run_cli
@@ -192,6 +193,32 @@ def test_a_trajectory_of_several_points_is_followed(tmp_path):
     (recording,) = load_recordings(tmp_path / "leg", ROBOT)
     line = np.stack([np.interp(recording.des_time * 1e9, COMMANDS, column) for column in DES.T], axis=1)
     assert np.allclose(recording.des_dof_pos, line, atol=1e-6) and len(recording.des_time) > len(COMMANDS)
+
+
+def test_a_trajectory_ends_where_the_next_message_replaces_it(tmp_path):
+    kind, second = "trajectory_msgs/msg/JointTrajectory", 10**9
+    with Bag(tmp_path / "leg") as bag:
+        for k, ns in enumerate(STAMPS):
+            bag.state("/joint_states", NOON + ns, JOINTS, POS[k])
+        for begin, targets in ((0.0, (0.0, 1.0)), (0.5013, (0.5, 0.0)), (0.9, (0.1, 0.3))):
+            points = [bag.point([x, -x], after=at) for x, at in zip(targets, (0, second), strict=True)]
+            message = bag.type(kind)(header=bag.header(0), joint_names=list(JOINTS), points=points)
+            bag.write("/leg/joint_trajectory", kind, NOON + int(begin * second), message)
+    (recording,) = load_recordings(tmp_path / "leg", ROBOT)
+    at = recording.des_time
+    first, then, last = at, 0.5 - 0.5 * (at - 0.5013), 0.1 + 0.2 * (at - 0.9)
+    expected = np.where(at < 0.5013 - 1e-9, first, np.where(at < 0.9 - 1e-9, then, last))
+    assert np.allclose(recording.des_dof_pos, np.stack([expected, -expected], axis=1), atol=1e-9)
+
+
+def test_the_last_point_of_a_trajectory_is_commanded_whatever_its_span():
+    def point(nanosec, at):
+        time_from_start = SimpleNamespace(sec=0, nanosec=nanosec)
+        return SimpleNamespace(positions=[at], velocities=[], effort=[], time_from_start=time_from_start)
+
+    message = SimpleNamespace(joint_names=["hip"], points=[point(0, 0.0), point(7_000_000, 0.7)])
+    rows = [(at, float(values[0])) for at, _, values in rows_of(message, "/plan")]
+    assert rows == [(0, 0.0), (5_000_000, pytest.approx(0.5)), (7_000_000, 0.7)]
 
 
 def test_torque_in_and_motion_out_is_a_recording(tmp_path):
@@ -379,6 +406,22 @@ des_dof_pos = "c2"
 """
 
 
+def test_a_bad_episode_of_a_dataset_is_set_aside(tmp_path):
+    (tmp_path / "set/meta").mkdir(parents=True)
+    (tmp_path / "set/data").mkdir()
+    (tmp_path / "set/meta/info.json").write_text(json.dumps({"fps": 250}))
+    for i, count in enumerate((5, COUNT)):
+        columns = {"hip_pos": POS[:count, 0], "hip_cmd": HELD[:count, 0], "timestamp": np.arange(count) / 250}
+        columns["episode_index"] = np.full(count, i)
+        parquet.write_table(pa.table(columns), tmp_path / f"set/data/{i}.parquet")
+    reader = LogReader([str(tmp_path / "set")])
+    (recording,) = reader.recordings(str(tmp_path / "set"), Robot())
+    assert recording.name == "set episode 1"
+    assert "warning: set episode 0 is set aside" in reader.lines()[-1] and "[W20]" in reader.lines()[-1]
+    with pytest.raises(ValueError, match="found 5 samples"):
+        LogReader([], strict=True).recordings(str(tmp_path / "set"), Robot())
+
+
 def test_a_map_gives_units_signs_offsets_gear_ratios_currents_and_facts(tmp_path):
     (tmp_path / "map.toml").write_text(MAP)
     motor = (POS[:, 0] - 0.1) * 9.0 * -180 / np.pi
@@ -394,6 +437,31 @@ def test_a_map_gives_units_signs_offsets_gear_ratios_currents_and_facts(tmp_path
     assert recording.drive.stiffness.tolist() == [40.0, 40.0] and recording.drive.damping.tolist() == [1.0, 2.0]
     write_map(tmp_path / "again.toml", chosen)
     assert read_map(tmp_path / "again.toml") == chosen
+
+
+def test_a_map_with_an_infinite_limit_and_a_long_rate_reads_back_the_same(tmp_path):
+    source = Source(channel="q", unit="rad")
+    facts = {"effort_limit": {"hip": np.inf, "knee": 3.0}, "velocity_limit": [np.inf, 2.0], "comment": "two"}
+    columns = ColumnMap(joints={"hip": {"dof_pos": source}}, facts=facts, rate=1234.56789)
+    write_map(tmp_path / "map.toml", columns)
+    assert read_map(tmp_path / "map.toml") == columns
+
+
+def test_a_list_column_whose_first_row_is_empty_is_read(tmp_path):
+    rows_of_lists = [None, *POS[1:].tolist()]
+    columns = {"q": pa.array(rows_of_lists), "cmd": pa.array(HELD.tolist()), "time": STAMPS / 1e9}
+    parquet.write_table(pa.table(columns), tmp_path / "leg.parquet")
+    (recording,) = load_recordings(tmp_path / "leg.parquet", ROBOT)
+    assert recording.dof_pos == pytest.approx(POS[1:])
+
+
+def test_a_map_may_have_a_joint_that_robot_and_log_lack(tmp_path):
+    path = rows(["time", "hip pos", "hip cmd"], [STAMPS / 1e9, POS[:, 0], HELD[:, 0]], tmp_path / "leg.csv")
+    entries = [f'[joints.{joint}]\ndof_pos = "{joint} pos"\ndes_dof_pos = "{joint} cmd"\n' for joint in ("hip", "grip")]
+    (tmp_path / "map.toml").write_text("".join(entries))
+    reader = LogReader([str(path)], read_map(tmp_path / "map.toml"))
+    (recording,) = reader.recordings(str(path), Robot(joint_names=("hip",), wanted=("hip",)))
+    assert recording.joint_names == ("hip",) and not any("grip" in line for line in reader.lines())
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from pace_optim.recording.data import notes_by_kind
 from pace_optim.recording.dataset import start_speed
 from pace_optim.recording.gaps import split_at_gaps
 from pace_optim.recording.logs import ColumnMap, Robot, read_map, with_rate
+from pace_optim.recording.logs.words import meaning
 from pace_optim.recording.time_base import set_back, unrounded
 
 TIME = np.arange(800) / 200
@@ -134,6 +135,38 @@ def test_a_log_without_time_is_read_at_a_stated_rate(tmp_path):
     assert own.time == pytest.approx(TIME)
 
 
+def test_a_rate_that_a_log_with_time_does_not_need_is_named(tmp_path):
+    found = read(table(tmp_path / "log.csv", **arm()), columns=with_rate(None, 100.0))
+    assert found.recording.duration == pytest.approx(TIME[-1])
+    assert any("The rate of 100 Hz is not used" in line for line in found.lines)
+    own = {"time": TIME, "dof_pos/j": MOTION, "des_dof_pos/j": TARGET}
+    recording = load_recording(table(tmp_path / "own.csv", **own), rate=100.0)
+    assert any("The rate of 100 Hz is not used" in note for note in recording.notes)
+
+
+def test_one_column_of_two_joints_is_named(tmp_path):
+    (tmp_path / "map.toml").write_text(
+        "".join(f'[joints.{j}]\ndof_pos = "q_elbow"\ndes_dof_pos = "des_{j}"\n' for j in ARM.joint_names)
+    )
+    found = read(table(tmp_path / "log.csv", **arm()), columns=read_map(tmp_path / "map.toml"))
+    assert any("several joints: q_elbow (shoulder, elbow)" in note for note in found.recording.notes)
+
+
+def test_rows_without_a_date_are_left_out(tmp_path):
+    stamps = (np.datetime64("2026-11-25T10:00:00") + (1e9 * TIME).astype("timedelta64[ns]")).astype(str)
+    for empty in (0, 5, len(TIME) - 1):
+        cells = ["" if k == empty else f"{stamp}+01:00" for k, stamp in enumerate(stamps)]
+        rows = [f"{cell},{q:.6f},{target:.6f}" for cell, q, target in zip(cells, MOTION, TARGET, strict=True)]
+        (tmp_path / "log.csv").write_text("\n".join(["date,q_j,des_j", *rows]))
+        found = read(tmp_path / "log.csv", Robot()).recording
+        assert found.num_samples == len(TIME) - 1 and found.duration < TIME[-1] + 1e-6
+    time = stamps.astype("datetime64[ns]")
+    time[5] = np.datetime64("NaT")
+    np.savez(tmp_path / "own.npz", time=time, dof_pos=MOTION[:, None], des_dof_pos=TARGET[:, None])
+    with pytest.raises(ValueError, match="time has 1 values that are NaN"):
+        load_recording(tmp_path / "own.npz")
+
+
 def test_a_map_may_say_the_time_alone(tmp_path):
     path = table(tmp_path / "log.csv", zeit=TIME, q_j=MOTION, des_j=TARGET)
     (tmp_path / "map.toml").write_text('[time]\ncolumn = "zeit"\nunit = "s"\n')
@@ -199,6 +232,60 @@ def test_a_torque_tells_the_unit_by_the_gain(tmp_path):
     assert np.ptp(degrees.recording.dof_pos) == pytest.approx(np.ptp(20 * MOTION) * np.pi / 180, rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [
+        ("vel [mrad/s]", "mrad/s"),
+        ("vel_mrad_s", "mrad/s"),
+        ("vel [mdeg/s]", "mdeg/s"),
+        ("speed_deg_per_s", "deg/s"),
+        ("kneeVelRad/s", "rad/s"),
+        ("pos [mdeg]", "mdeg"),
+        ("tau [Ncm]", "N cm"),
+        ("tau_nmm", "N mm"),
+        ("tau [kN·m]", "kN m"),
+        ("tau [N-m]", "N m"),
+        ("tau (kg.cm)", "kgf cm"),
+        ("force [kN]", "kN"),
+    ],
+)
+def test_a_prefix_of_a_unit_is_part_of_it(name, unit):
+    said = meaning(f"knee_{name}" if "knee" not in name else name)
+    assert (said.unit, said.unknown_unit) == (unit, "") and said.joint == ("knee",)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"), [("torque_j [lbf in]", "lbf in"), ("temp_j [F]", "F"), ("dq_j [rad/s^2]", "rad/s^2")]
+)
+def test_a_series_in_a_unit_that_is_not_known_is_left_out_with_a_note(tmp_path, name, unit):
+    found = read(table(tmp_path / "log.csv", time=TIME, q_j=MOTION, des_j=TARGET, **{name: 10 * TARGET}), Robot())
+    one = found.recording
+    assert one.joint_names == ("j",) and one.dof_effort is None and one.temperature is None and one.dof_vel is None
+    assert any(f"{name}: the unit is not known" in line for line in found.lines)
+
+
+def test_positions_in_an_unknown_unit_are_not_taken_for_radians(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = table(tmp_path / "log.csv", **{"time": TIME, "q_j [0.01 deg]": MOTION, "des_j [0.01 deg]": TARGET})
+    with pytest.raises(ValueError, match=r"q_j \[0.01 deg\], des_j \[0.01 deg\]: the unit is not known"):
+        read(path, Robot())
+
+
+def test_brackets_that_hold_a_joint_hold_no_unit():
+    named = {"pos[hip]": ("hip",), "q[0]": ("0",), "pos (left knee)": ("left", "knee"), "q[jaw]": ("jaw",)}
+    named |= {"pos[j1]": ("j", "1"), "position[m2]": ("m", "2"), "q[k]": ("k",), "q[can]": ("can",)}
+    for name, joint in named.items():
+        assert meaning(name).joint == joint and not meaning(name).unknown_unit
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-3, 180 / np.pi])
+def test_a_speed_that_contradicts_its_position_is_left_out(tmp_path, scale):
+    speed = scale * 2.4 * np.cos(3 * TIME)
+    found = read(table(tmp_path / "log.csv", time=TIME, q_rad=MOTION, dq_rad_s=speed, des_rad=TARGET), WHEEL)
+    assert (found.recording.dof_vel is None) == (scale != 1.0)
+    assert any("so one of the two units is wrong" in line for line in found.lines) == (scale != 1.0)
+
+
 @pytest.mark.parametrize("name", ["Present_Load", "load_percent", "torque_pct", "effort_permille"])
 def test_a_load_register_is_no_torque(tmp_path, name):
     found = read(table(tmp_path / "log.csv", time=TIME, q_j=MOTION, des_j=TARGET, **{name: 10 * TARGET}), Robot())
@@ -238,6 +325,13 @@ def test_a_log_whose_clock_was_set_back_is_two_recordings(tmp_path):
         load_recording(tmp_path / "own.npz")
 
 
+def test_a_clock_that_is_set_back_in_its_first_rows_costs_these_rows_alone(tmp_path):
+    time = np.concatenate([5.0 + TIME[:10], TIME[10:]])
+    found = read(table(tmp_path / "back.csv", time=time, q_j=MOTION, des_j=TARGET), Robot())
+    assert found.recording.num_samples == len(TIME) - 10 and found.recording.name == "back"
+    assert any("Parts of fewer than 20 rows are left out" in line for line in found.lines)
+
+
 @pytest.mark.parametrize("gap", [0.3, 0.05])
 def test_a_gap_splits_and_a_clock_that_jumps_is_told_from_lost_samples(gap):
     fine = np.arange(1600) / 400
@@ -258,6 +352,21 @@ def test_a_gap_in_which_nothing_happens_or_that_cubics_bridge_does_not_split():
     short = np.abs(fine - 2) > 0.01
     whole = recording(fine[short], moving[short], moving[short])
     assert split_at_gaps(whole) == [whole]
+
+
+def test_a_gap_before_the_first_command_is_left_out_with_what_comes_before():
+    time = TIME + np.where(np.arange(len(TIME)) >= 100, 0.2, 0.0)
+    late = replace(recording(time, MOTION, TARGET), des_time=time[150:], des_dof_pos=TARGET[150:, None])
+    (whole,) = split_at_gaps(late)
+    assert whole.num_samples == len(TIME) - 150 and any("no command is known" in note for note in whole.notes)
+
+
+def test_a_gap_of_a_standstill_splits_where_it_is_too_long_to_bridge():
+    still = np.zeros_like(TIME)
+    still[:300], still[500:] = np.sin(TIME[:300] - TIME[300]), np.sin(TIME[500:] - TIME[500])
+    time = TIME + np.where(np.arange(len(TIME)) >= 400, 0.7, 0.0)
+    parts = split_at_gaps(recording(time, still, still))
+    assert [part.num_samples for part in parts] == [400, 400] and "no samples for 0.705 s" in parts[0].notes[0]
 
 
 @pytest.mark.parametrize("noise", [1e-5, 1e-4, 5e-4])

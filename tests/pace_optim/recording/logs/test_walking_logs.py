@@ -44,8 +44,32 @@ def test_columns_of_a_table_are_an_imu_by_their_names(names):
     assert set(base.series) == {"base_ang_vel", "base_lin_acc"}
 
 
+@pytest.mark.parametrize(
+    ("gyro", "of_gyro", "acc", "of_acc"),
+    [
+        ("gyro_{} [deg/s]", "deg/s", "acc_{} [g]", "g"),
+        ("gyro_{} (dps)", "deg/s", "accel_{} [m/s^2]", "m/s²"),
+        ("imu_gyro_{}_rad_s", "rad/s", "imu_acc_{}_mg", "mg"),
+        ("gyro.{}", "", "acc_{}[m/s²]", "m/s²"),
+    ],
+)
+def test_an_imu_whose_columns_carry_units_is_read_in_them(gyro, of_gyro, acc, of_acc):
+    columns = {name.format(axis): TIME for name in (gyro, acc) for axis in "xyz"}
+    base, notes = guess_base(log(**columns))
+    assert base.series["base_ang_vel"].unit == of_gyro and base.series["base_lin_acc"].unit == of_acc
+    assert base.series["base_ang_vel"].names == tuple(gyro.format(axis) for axis in "xyz")
+    assert "The base moves" in notes[0]
+
+
 def test_half_an_imu_is_none():
-    assert not guess_base(log(**{f"gyro_{axis}": TIME for axis in "xyz"}))[0].series
+    base, notes = guess_base(log(**{f"gyro_{axis}": TIME for axis in "xyz"}))
+    assert not base.series and all(word in notes[0] for word in ("gyro_x, gyro_y, gyro_z", "not used", "[base]"))
+
+
+def test_an_imu_in_units_that_are_not_known_is_named():
+    columns = {name.format(axis): TIME for name in ("gyro_{} [LSB]", "acc_{} [LSB]") for axis in "xyz"}
+    base, notes = guess_base(log(**columns))
+    assert not base.series and "acc_x [LSB]" in notes[0] and not guess_base(log(hip_acc=TIME))[1]
 
 
 def test_units_of_a_map_count_and_contacts_keep_to_the_nearest_value():

@@ -134,6 +134,23 @@ def test_feed_forward_is_read_and_simulated_as_the_drive_takes_it():
     assert taken.command_effort == pytest.approx(law.feed_forward * recording.command_effort)
 
 
+def test_a_feed_forward_in_one_recording_of_two_is_read():
+    several = replace(recorded(feed_forward=0.5), name="a"), replace(recorded(seconds=6.0), name="b")
+    for order in (several, several[::-1]):
+        (line, *_) = drives(*order).notes
+        assert "feed-forward 0.5 ±" in line and "kp 40" in line
+
+
+def test_a_gain_of_a_joint_without_a_sensor_is_refined_within_what_its_torque_says():
+    found = drives(recorded(noise=0.1))
+    factors = {"stiffness": "proportional_gain.gain"}
+    alone, other, own = (
+        found.gain_bounds(["stiffness"], factors, sensed)["proportional_gain.gain"]["servo"]
+        for sensed in ((), ("knee",), ("servo",))
+    )
+    assert alone == other and own == (0.2, 1.0, 5.0)
+
+
 def test_a_constant_torque_of_the_drive_is_simulated():
     taken = drives(recorded(offset=3.0)).recordings[0]
     assert taken.command_effort == pytest.approx(3.0, abs=0.01)
