@@ -14,12 +14,12 @@ from torque_sequence import DT, GAINS, JOINTS, sequence, write_result
 from pace_actuators import ActuatorActions, IdentifiedDrives, PaceDCMotor, PaceDCMotorCfg
 from pace_envs import ManagerBasedRLEnv, set_physics_dt
 from pace_envs.from_model import cfg_from_model
-from pace_envs.identified import load_identified_cfg
+from pace_envs.identified import load_identified_cfg, use_identified
 from pace_envs.task_source import EnvironmentRecord
 from pace_optim.export import export
 from pace_optim.export.mjcf import model_of
 from pace_optim.export.mjcf_drives import write_drives
-from pace_optim.export.plain_drive import PlainDrive
+from pace_optim.export.plain_drive import PlainDrive, plain_drives
 from pace_optim.problem.parameter_space import ParameterSpace
 
 STEPS = 400
@@ -294,6 +294,26 @@ def test_what_steps_of_second_order_identified_moves_so_in_plain_steps(tmp_path,
     found = replay(fixed_in_the_air(exported.text), names, targets.repeat(4, axis=0), targets[0])[::4]
     assert drive.implicit == stiff and "compensate for" in " ".join(exported.notes)
     assert np.ptp(expected, axis=0).min() > 0.2 and np.abs(found - expected).max() < error
+
+
+@pytest.mark.parametrize("rate", [{"drive_dt": DT / 4}, {}], ids=["drive_dt", "held for a control step"])
+def test_a_fits_loop_rate_replaces_that_of_a_model_file_with_gains(tmp_path, rate):
+    """The file's loop is continuous: a stated or found rate was refused in training and exports, or left out."""
+    path = tmp_path / "arm.xml"
+    path.write_text(STIFF)
+    cfg = cfg_from_model(path)
+    names = list(cfg.sim2real.joint_order)
+    parameters = {name: dict.fromkeys(names, 0.1) for name in ("armature", "viscous_friction", "friction")}
+    parameters["encoder_bias"] = dict.fromkeys(names, 0.0)
+    drive = {name: dict.fromkeys(names, value) for name, value in rate.items()}
+    result = result_of(tmp_path, path, cfg, parameters, {**HELD, **drive})
+    exec(export(result, "cfg").text, written := {})
+    use_identified(cfg, result)
+    for (each,) in (written["ACTUATORS"].values(), cfg.scene.robot.actuators.values()):
+        assert not each.implicit and each.drive_dt == rate.get("drive_dt")
+    plain = plain_drives(IdentifiedDrives.load(result))[0]
+    assert {drive.run_dt for drive in plain.values()} == {rate.get("drive_dt", DT)}
+    assert any("Euler" in note for note in export(result, "mjcf").notes)
 
 
 @pytest.mark.parametrize("page", ["newton", "mjlab_native"])
