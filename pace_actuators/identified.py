@@ -155,6 +155,11 @@ class IdentifiedDrives:
             return {}
         return {j: value for j, value in self.values(name, joints).items() if f"{name}/{j}" not in self.undetermined}
 
+    @property
+    def is_continuous(self) -> bool:
+        """Whether the controller of a drive ran continuously."""
+        return any(self.drive.get("implicit", {}).values())
+
     def find_joints(self, joint_names_expr: str | Sequence[str] | None) -> list[str]:
         """Its joints that match, in order; all for ``None``.
 

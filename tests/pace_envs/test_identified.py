@@ -203,6 +203,13 @@ def test_what_cannot_be_represented_is_said(result):
         check_representable(drives, World(name="a world", friction_per_step=False))
 
 
+def test_a_continuous_loop_is_said_to_need_friction_of_each_step(result):
+    """Only an exported page said so: a drive from a result had no damping in Isaac Lab."""
+    drives = IdentifiedDrives.load(changed(result, drive={"implicit": dict.fromkeys(JOINTS, 1.0)}))
+    found = {world.name: " ".join(check_representable(drives, world)) for world in (HERE, MJLAB, ISAACLAB)}
+    assert ["runs continuously" in said for said in found.values()] == [False, True, True]
+
+
 def test_soft_friction_is_in_training_and_wherever_mujoco_is(result):
     changed(result, effects=["soft_friction"], parameters={"soft_friction.time_constant": {"all": 0.02}})
     env, drives = walking(result), IdentifiedDrives.load(result)
