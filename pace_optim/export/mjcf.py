@@ -19,6 +19,7 @@ from pace_actuators.effects.command import GravityCompensation
 from pace_actuators.text import listed
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.identified import load_identified_cfg, use_identified
+from pace_envs.link_inertia import FIELDS, state_inertia, state_inertias
 from pace_envs.model_file import compile_model, missing_files, read_model_file
 from pace_envs.motor_coordinates import DrivenJoints, add_motors
 from pace_envs.robot_spec import load_robot_spec
@@ -35,7 +36,7 @@ from pace_optim.export.plain_drive import (
     soft_frictions,
 )
 
-_BODY_FIELDS = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat")
+_BODY_FIELDS = (*FIELDS, "body_pos", "body_quat")
 
 
 def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, list[str]]:
@@ -67,7 +68,7 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
     if spec.meshes:
         spec.meshdir = str((source.parent / spec.meshdir).resolve())
-    changed = _write_bodies(spec, plain, env)
+    changed = _write_bodies(spec, source, plain, env)
     weights = dict(zip(robot.joint_names, env.sim.friction_weights(robot.dof_columns)[0].tolist(), strict=True))
     env.close()
     plain.close()
@@ -228,7 +229,7 @@ def _set(joint: Any, attribute: str, value: float) -> None:
         setattr(joint, attribute, value)
 
 
-def _write_bodies(spec: mujoco.MjSpec, plain: ManagerBasedRLEnv, env: ManagerBasedRLEnv) -> list[str]:
+def _write_bodies(spec: mujoco.MjSpec, source: Path, plain: ManagerBasedRLEnv, env: ManagerBasedRLEnv) -> list[str]:
     """Write the rigid bodies that effects have changed; returns their names."""
     model, changed = env.sim.model, []
     for b in range(1, model.nbody):
@@ -236,12 +237,12 @@ def _write_bodies(spec: mujoco.MjSpec, plain: ManagerBasedRLEnv, env: ManagerBas
         after = {field: env.sim.expand(field)[0, b] for field in _BODY_FIELDS}
         if all(torch.allclose(before[f], after[f], rtol=1e-12, atol=1e-15) for f in _BODY_FIELDS):
             continue
+        if not changed:
+            state_inertias(spec, compile_model(spec, source))
         body = spec.body(model.body(b).name)
         changed.append(body.name)
-        body.explicitinertial = True
-        body.mass = float(after["body_mass"])
-        body.inertia, body.fullinertia = after["body_inertia"].numpy(), np.full(6, np.nan)
-        body.ipos, body.iquat = after["body_ipos"].numpy(), after["body_iquat"].numpy()
+        mass, com, moments, quat = (after[field].numpy() for field in FIELDS)
+        state_inertia(body, float(mass), com, moments, quat)
         for field, attribute in (("body_pos", "pos"), ("body_quat", "quat")):
             if not torch.equal(before[field], after[field]):
                 setattr(body, attribute, after[field].numpy())

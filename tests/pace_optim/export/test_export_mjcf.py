@@ -316,6 +316,40 @@ def test_a_fits_loop_rate_replaces_that_of_a_model_file_with_gains(tmp_path, rat
     assert any("Euler" in note for note in export(result, "mjcf").notes)
 
 
+WEIGHED = """
+<mujoco>
+  <compiler OPTIONS/>
+  <worldbody>
+    <body name="upper"><joint name="shoulder" axis="0 1 0"/>
+      <inertial pos="0.2 0 0" mass="4" diaginertia="0.02 0.06 0.06"/><geom size="0.05" mass="1"/>
+      <body name="hand" pos="0.4 0 0"><joint name="wrist" axis="1 0 0"/><geom size="0.04" mass="1"/></body></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    ("options", "upper"),
+    [('inertiafromgeom="true"', 1.0), ('settotalmass="10"', 8.0), ('inertiagrouprange="0 5"', 4.0)],
+)
+def test_an_identified_mass_holds_where_a_file_weighs_geoms_or_all_bodies_together(tmp_path, options, upper):
+    """Gymnasium's models: the identified mass was the geoms' again, 1.0 of 1.8 kg, without a word."""
+    path = tmp_path / "arm.xml"
+    path.write_text(WEIGHED.replace("OPTIONS", options))
+    cfg = cfg_from_model(path)
+    names = list(cfg.sim2real.joint_order)
+    parameters = {name: dict.fromkeys(names, 0.1) for name in ("armature", "viscous_friction", "friction")}
+    result = result_of(tmp_path, path, cfg, parameters | {"encoder_bias": dict.fromkeys(names, 0.0)}, HELD)
+    changed(result, links={"hand": {"mass": 1.8, "com": [0.01, 0.0, 0.02], "inertia": [0.002] * 3 + [0.0] * 3}})
+    use_identified(cfg, result)
+    env = ManagerBasedRLEnv(cfg)
+    exported = mujoco.MjModel.from_xml_string(export(result, "mjcf").text)
+    for model in (env.sim.model, exported):
+        found = {name: float(model.body(name).mass[0]) for name in ("upper", "hand")}
+        assert found == pytest.approx({"upper": upper, "hand": 1.8}) and model.body("hand").ipos[2] == 0.02
+    env.close()
+
+
 @pytest.mark.parametrize("page", ["newton", "mjlab_native"])
 def test_pages_for_other_simulators_move_so_in_plain_steps_too(tmp_path, page):
     """They had the identified armature and kd: at steps of 0.5 ms, an xArm 7 moved 2 mrad beside its fit."""
