@@ -31,7 +31,7 @@ class Motion:
     time: np.ndarray
     """(K,) [s]."""
     measured: np.ndarray
-    """Measured joint positions, encoder bias taken off, (K, m) [rad or m]."""
+    """Measured positions of the joints themselves, (K, m) [rad or m]."""
     simulated: np.ndarray
     """Simulated joint positions, (K, m) [rad or m]."""
     base: np.ndarray | None = None
@@ -55,7 +55,7 @@ def motions_of(
 
     Args:
         joint_names: The n joints that were measured.
-        encoder_bias: What an encoder shows beyond the joint's position, (n,) [rad or m].
+        encoder_bias: An encoder shows its joint's position less this, (n,) [rad or m].
     """
     driven = DrivenJoints.of_model(model, joint_names)
     columns = _columns(model, driven.joints)
@@ -78,7 +78,7 @@ def _motion(
     positions = []
     for shown in (recording.measured, recording.measured + recording.error):
         whole = np.tile(home, (len(kept), 1))
-        whole[:, columns] = driven.to_joints(np.nan_to_num(shown[kept] - bias))
+        whole[:, columns] = driven.to_joints(np.nan_to_num(shown[kept] + bias))
         positions.append(_closed(model, columns, whole) if model.neq else whole)
     return Motion(
         name=recording.name,

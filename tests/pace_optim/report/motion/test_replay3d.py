@@ -6,6 +6,7 @@ import pytest
 import torch
 from browser import CHROMIUM, Browser
 
+from pace_actuators import PaceDCMotor, PaceDCMotorCfg
 from pace_actuators.files import write_tensors
 from pace_envs.model_file import read_model_file
 from pace_optim.commands.replay import main
@@ -141,13 +142,17 @@ def test_play_goes_on_and_pause_stops(page):
     assert page.evaluate("document.querySelector('.replay').replay.state.at") == at
 
 
-def test_the_encoder_s_bias_is_taken_off():
-    model = mujoco.MjModel.from_xml_string(LEG)
+def test_joints_stand_where_an_encoder_with_bias_shows_what_was_measured():
+    """The bias was taken off once more: joints stood beside the true position by twice the bias."""
+    bias = [0.02, 0.0, -0.01]
+    drive = PaceDCMotor(PaceDCMotorCfg(joint_names_expr=".*", encoder_bias=bias), JOINTS, slice(None), 1)
     shown = recording(3)
-    (motion,) = motions_of(model, JOINTS, [shown], [0.02, 0.0, -0.01])
+    (motion,) = motions_of(mujoco.MjModel.from_xml_string(LEG), JOINTS, [shown], bias)
     assert motion.time[0] == 0.0
-    assert motion.measured[0] == pytest.approx(shown.measured[0] - [0.02, 0.0, -0.01])
-    assert motion.simulated[0] == pytest.approx(shown.measured[0] + shown.error[0] - [0.02, 0.0, -0.01])
+    for joints, encoder in ((motion.measured, shown.measured), (motion.simulated, shown.measured + shown.error)):
+        position = torch.tensor(joints[:1])
+        read = drive.observe(position, torch.zeros_like(position)) - drive.encoder_bias
+        assert read[0].numpy() == pytest.approx(encoder[0])
 
 
 def test_joints_of_a_closed_chain_that_no_encoder_measures_follow():
