@@ -39,6 +39,10 @@ from pace_optim.export.plain_drive import (
 _BODY_FIELDS = (*FIELDS, "body_pos", "body_quat")
 
 
+_SAME_GRAVITY = 0.05
+"""Largest difference of two values of the same gravity [m/s²]."""
+
+
 def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, list[str]]:
     """The robot's model with identified armature, damping and frictionloss, changed rigid bodies, and its drives.
 
@@ -56,6 +60,7 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
     spec, left_out = model_of(source)
     couplings = cfg.scene.robot.couplings
     add_motors(spec, couplings, source)
+    of_the_fit = _as_in_the_fit(spec, cfg)
     driven = int(robot.dof_columns[0])
     for element in [*spec.joints, *spec.tendons]:  # what has no drive rubs as in the fit too
         element.solref_friction, element.solimp_friction = model.dof_solref[driven], model.dof_solimp[driven]
@@ -85,8 +90,19 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
     _write_soft_friction(spec, source, drives, weights, actuators)
     if changed:
         notes.append(f"changed rigid bodies, which are in the model: {', '.join(changed)}.")
-    notes += [*effect_notes(drives, held), *left_out]
+    notes += [*of_the_fit, *effect_notes(drives, held), *left_out]
     return _with_comment(spec, notes, drives, joints_only), notes
+
+
+def _as_in_the_fit(spec: mujoco.MjSpec, cfg: Any) -> list[str]:
+    """Let gravity be the fit's; returns what of the fit's rig is other than in the file, in words."""
+    notes, gravity = [], np.array(cfg.sim.gravity)
+    if np.abs(spec.option.gravity - gravity).max() > _SAME_GRAVITY:
+        notes.append(f"gravity is that of the fit, {gravity.tolist()} m/s²; the model file has another.")
+    spec.option.gravity = gravity
+    if held := [f"{name} at {position:.4g}" for name, position in cfg.scene.robot.held_joints.items()]:
+        notes.append(f"held in the fit, free here: {', '.join(held)} [rad, of slides m].")
+    return notes
 
 
 def _compensated(spec: mujoco.MjSpec, drives: IdentifiedDrives, notes: list[str]) -> list[str]:

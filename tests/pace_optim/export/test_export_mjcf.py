@@ -1,6 +1,7 @@
 """A user of plain MuJoCo gets the identified drive with the exported file."""
 
 import json
+import sys
 from pathlib import Path
 
 import mujoco
@@ -406,6 +407,27 @@ def test_a_model_whose_meshes_are_missing_is_written_without_them(tmp_path):
     assert notes == ["2 files of the model are missing (gone.stl, gone.png): left out."]
     path.write_text(STIFF)
     assert model_of(path)[1] == []
+
+
+def test_gravity_and_held_joints_of_the_fit_are_in_the_file_or_in_a_note(tmp_path, monkeypatch):
+    """A rig on a wall: its export hung down."""
+    path = tmp_path / "arm.xml"
+    path.write_text(STIFF)
+    cfg = cfg_from_model(path).holding({"wrist": 0.3})
+    parameters = {name: {"shoulder": 0.1} for name in ("armature", "viscous_friction", "friction", "encoder_bias")}
+    exported = export(result_of(tmp_path, path, cfg, parameters, {}), "mjcf")
+    assert mujoco.MjModel.from_xml_string(exported.text).opt.gravity.tolist() == [0.0, 0.0, -9.81]
+    assert "free here: wrist at 0.3" in " ".join(exported.notes) and "gravity" not in " ".join(exported.notes)
+
+    def on_a_wall(drives):
+        cfg = load_identified_cfg(drives)
+        cfg.sim.gravity = (0.0, 9.81, 0.0)
+        return cfg
+
+    monkeypatch.setattr(sys.modules["pace_optim.export.mjcf"], "load_identified_cfg", on_a_wall)
+    exported = export(tmp_path / "result.json", "mjcf")
+    assert mujoco.MjModel.from_xml_string(exported.text).opt.gravity.tolist() == [0.0, 9.81, 0.0]
+    assert "gravity is that of the fit" in " ".join(exported.notes)
 
 
 def test_joints_without_drives_rub_as_in_the_fit(tmp_path):
