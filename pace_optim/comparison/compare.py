@@ -96,7 +96,7 @@ def compare_run(run: RunTracks) -> dict[str, Any]:
         "physics_dt": run.physics_dt,
         "data": list(run.data),
         "joint_names": list(joints),
-        "summary": " ".join(filter(None, [_summary(compared), _carried(joints, compared)])),
+        "summary": " ".join(filter(None, [summary_of(compared), _carried(joints, compared)])),
         "worst_places": [place_content(place) for place in worst],
         "rmse": rmse_by_part(run.tracks),
         "noise_floor": float(np.sqrt(np.mean(np.square(floors)))),
@@ -136,11 +136,11 @@ def _unrepeatable(joints: Sequence[str], compared: Sequence[JointComparison], tr
     ]
 
 
-def _summary(compared: Sequence[JointComparison]) -> str:
+def summary_of(compared: Sequence[JointComparison]) -> str:
     """How many joints are explained, in a sentence or two."""
     count = len(compared)
-    done = sum(_explained(joint.content) for joint in compared)
-    spread = sum(not _explained(joint.content) and not joint.places for joint in compared)
+    done = sum(joint.is_explained for joint in compared)
+    spread = sum(not joint.is_explained and not joint.places for joint in compared)
     if done == count:
         which, near = "The joint is" if count == 1 else f"All {count} joints are", 100 * (AT_THE_FLOOR - 1)
         return f"{which} within {near:.0f} % of the noise: a better model could explain little more of this data."
@@ -159,11 +159,6 @@ def _summary(compared: Sequence[JointComparison]) -> str:
 def _carried(joints: Sequence[str], compared: Sequence[JointComparison]) -> str:
     """Which few joints hold nearly all of the squared error; "" where many do."""
     return carried_by({joint: max(own.content["rmse"].values()) for joint, own in zip(joints, compared, strict=True)})
-
-
-def _explained(content: dict[str, Any]) -> bool:
-    rmse = content["noise_floor"] / max(1 - content["share_above_floor"], 1e-12) ** 0.5
-    return rmse <= AT_THE_FLOOR * content["noise_floor"] or max(content["rmse"].values()) < NEGLIGIBLE
 
 
 def plain(content: Any) -> Any:
