@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from pace_envs.task_source import file_digest
 from pace_optim.estimate.error_bars.assessment import trajectories
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.problem import Problem
@@ -18,7 +17,6 @@ from pace_optim.recording import Drive, Recording
 from pace_optim.recording.carried import part_of_phase
 from pace_optim.run.open import open_problem
 from pace_optim.run.result import FitResult
-from pace_optim.run.settings import FitSettings
 from pace_optim.run.tensors import read_trajectory
 
 from .drive_loads import load_torques
@@ -138,7 +136,7 @@ def load_tracks(
         bias = np.array([result.parameters["encoder_bias"][name] for name in problem.joint_names])
         loads = load_torques(Evaluator(problem.make_env, problem.dataset, problem.space), bias)
     groups = _groups(content["recordings"], recordings)
-    trained = _trained_before(folder, data)
+    before = read_trajectory(folder)["recordings"] if data and (folder / "best_trajectory.pt").is_file() else []
     tracks = tuple(
         Track(
             name=entry["name"],
@@ -146,7 +144,7 @@ def load_tracks(
             target=np.asarray(entry["des_dof_pos"]),
             measured=np.asarray(entry["dof_pos"]),
             error=np.asarray(entry["sim_dof_pos"]) - np.asarray(entry["dof_pos"]),
-            train=trained[r] if trained and len(trained[r]) == len(entry["time"]) else _train(entry, bool(data)),
+            train=_train(entry, before if data else [entry]),
             load=None if loads is None else loads[r],
             enabled=_enabled(entry),
             group=groups[r],
@@ -187,15 +185,20 @@ def _are_those(recordings: Sequence[Recording], content: dict[str, Any]) -> bool
     """Whether files read again hold what the run was fitted to."""
     entries = content["recordings"]
     return len(recordings) == len(entries) and all(
-        r.dof_pos.shape == tuple(entry["dof_pos"].shape)
-        and np.allclose(r.dof_pos, entry["dof_pos"], rtol=0, atol=_SAME)
-        for r, entry in zip(recordings, entries, strict=True)
+        _is_measured(recording.dof_pos, entry) for recording, entry in zip(recordings, entries, strict=True)
     )
 
 
-def _train(entry: dict[str, Any], others: bool) -> np.ndarray:
-    train = np.asarray(entry["train"]).astype(bool)
-    return np.zeros_like(train) if others else train
+def _is_measured(positions: np.ndarray, entry: dict[str, Any]) -> bool:
+    """Whether a recording's positions are those of a trajectory."""
+    own = np.asarray(entry["dof_pos"])
+    return positions.shape == own.shape and np.allclose(positions, own, rtol=0, atol=_SAME)
+
+
+def _train(entry: dict[str, Any], before: Sequence[dict[str, Any]]) -> np.ndarray:
+    """Which samples of a recording the run was trained on: those of the same one among its own recordings."""
+    same = (own for own in before if _is_measured(np.asarray(entry["dof_pos"]), own))
+    return np.asarray(next(same, {"train": np.zeros(len(entry["time"]))})["train"]).astype(bool)
 
 
 def _enabled(entry: dict[str, Any]) -> np.ndarray:
@@ -203,20 +206,6 @@ def _enabled(entry: dict[str, Any]) -> np.ndarray:
     if "torque_enable" in entry:
         return np.asarray(entry["torque_enable"]).astype(bool)
     return np.ones(len(entry["time"]), dtype=bool)
-
-
-def _trained_before(folder: Path, data: Sequence[str]) -> list[np.ndarray]:
-    """For files named anew, which samples the run was trained on: those of the run's recordings, by their digests."""
-    if not data or not (folder / "best_trajectory.pt").is_file():
-        return []
-    digests = FitSettings.load(folder / "settings.json")[1].digests  # in the order of the recordings
-    entries = read_trajectory(folder)["recordings"]
-    if len(digests) != len(entries):
-        return []
-    known = {
-        digest: np.asarray(entry["train"]).astype(bool) for digest, entry in zip(digests.values(), entries, strict=True)
-    }
-    return [known.get(file_digest(path), np.zeros(0, dtype=bool)) for path in data]
 
 
 def _groups(entries: Sequence[dict[str, Any]], recordings: Sequence[Recording] | None) -> list[int]:
