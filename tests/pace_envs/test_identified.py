@@ -401,6 +401,8 @@ def test_a_finer_step_keeps_the_controllers_rate_with_effects_too(result):
 def test_the_task_to_train_in_is_that_of_the_fit_s_robot_or_what_there_is_is_told(result):
     assert _task_for(str(result)) == WALK
     content = json.loads(result.read_text())
+    result.write_text(json.dumps(content | {"task": "Pace-SO101-v0"}))
+    assert _task_for(str(result)) == "Pace-SO101-Reach-v0"
     result.write_text(json.dumps(content | {"task": "/tmp/head.xml"}))
     with pytest.raises(ValueError, match=r"fit of /tmp/head\.xml, which has no task to train in.*Pace-Go2-Velocity-v0"):
         _task_for(str(result))

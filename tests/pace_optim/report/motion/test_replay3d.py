@@ -284,6 +284,10 @@ def test_the_command_writes_a_page_of_its_own(tmp_path, monkeypatch, capsys):
     page = (folder / "replay.html").read_text("utf-8")
     assert 'class="replay"' in page and "Plotly" not in page and len(page) < 200_000
     assert capsys.readouterr().out.splitlines()[-1] == f"run: {folder}"
+    elsewhere = tmp_path / "new" / "folder" / "x.html"
+    monkeypatch.setattr("sys.argv", ["replay", str(folder), "--viewer", "none", "--output", str(elsewhere)])
+    main()
+    assert elsewhere.read_text("utf-8") == page
 
 
 def test_without_a_model_the_command_says_so(tmp_path, monkeypatch):
