@@ -247,7 +247,8 @@ def _set(joint: Any, attribute: str, value: float) -> None:
 
 def _write_bodies(spec: mujoco.MjSpec, source: Path, plain: ManagerBasedRLEnv, env: ManagerBasedRLEnv) -> list[str]:
     """Write the rigid bodies that effects have changed; returns their names."""
-    model, changed = env.sim.model, []
+    model = env.sim.model
+    changed: list[str] = []
     for b in range(1, model.nbody):
         before = {field: plain.sim.expand(field)[0, b] for field in _BODY_FIELDS}
         after = {field: env.sim.expand(field)[0, b] for field in _BODY_FIELDS}

@@ -11,8 +11,8 @@ import mujoco
 import numpy as np
 
 from pace_envs.motor_coordinates import DrivenJoints
+from pace_optim.run.tensors import RecordingData
 
-from ..run_data import RecordingData
 from .scene import scalar_joints
 
 _RATE = 50.0

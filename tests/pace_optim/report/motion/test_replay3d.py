@@ -13,7 +13,7 @@ from pace_optim.commands.replay import main
 from pace_optim.report import write_report
 from pace_optim.report.motion import looks_of, motions_of, scene_of
 from pace_optim.report.motion.motion import add_ghost
-from pace_optim.report.run_data import RecordingData
+from pace_optim.run.tensors import RecordingData
 
 from run_folders import JOINTS, make_trajectory, write_run  # isort: skip
 
@@ -60,9 +60,8 @@ def recording(n: int, samples: int = 400, seed: int = 0) -> RecordingData:
     measured = 0.4 * np.sin(tempo * time[:, None] + phase)
     error = 0.01 * np.cos(7 * time[:, None] + phase)
     train = np.ones(samples, dtype=bool)
-    return RecordingData(
-        name="chirp", time=time, target=measured, measured=measured, error=error, train=train, held_out=~train
-    )
+    series = {"target": measured, "measured": measured, "simulated": measured + error}
+    return RecordingData(name="chirp", time=time, **series, train=train, held_out=~train, enabled=train)
 
 
 @pytest.fixture(scope="module")
