@@ -95,7 +95,7 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
 
 
 def _as_in_the_fit(spec: mujoco.MjSpec, cfg: Any) -> list[str]:
-    """Let gravity be the fit's; returns what of the fit's rig is other than in the file, in words."""
+    """Let gravity be the fit's; returns how the fit's rig differs from the file, in words."""
     notes, gravity = [], np.array(cfg.sim.gravity)
     if np.abs(spec.option.gravity - gravity).max() > _SAME_GRAVITY:
         notes.append(f"gravity is that of the fit, {gravity.tolist()} m/s²; the model file has another.")
