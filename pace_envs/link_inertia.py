@@ -171,7 +171,7 @@ def write_links(spec: mujoco.MjSpec, model: mujoco.MjModel, links: Mapping[str, 
 
 
 def state_inertia(body: mujoco.MjsBody, mass: float, com: Any, moments: Any, quat: Any) -> None:
-    """Write a body's mass, centre of mass, principal moments and their axes, instead of its own."""
+    """Write a body's mass, centre of mass, principal moments and their axes, instead of the present ones."""
     body.explicitinertial = True
     body.mass, body.ipos = mass, com
     body.inertia, body.iquat, body.fullinertia = moments, quat, np.full(6, np.nan)

@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from pace_actuators.joint_units import JointType, all_hinges, units_for
-from pace_actuators.text import position_text, position_unit
+from pace_actuators.text import count_in_short, position_text, position_unit
 from pace_optim.run.history import History
 from pace_optim.run.tensors import RecordingData, Trajectories, held_out_spans, rms
 
@@ -162,14 +162,6 @@ def _steps_above(axes: Axes, steps: Sequence[int]) -> None:
     axes.set_xlim(0.5, count + 0.5)
     marks = np.unique(np.linspace(1, count, min(6, count)).round().astype(int))
     upper = axes.secondary_xaxis("top")
-    upper.set_xticks(marks, [_in_short(steps[mark - 1]) for mark in marks])
+    upper.set_xticks(marks, [count_in_short(steps[mark - 1]) for mark in marks])
     upper.set_xlabel("simulated steps")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-
-
-def _in_short(count: float) -> str:
-    """A count with a suffix: 3.49 M."""
-    for size, suffix in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if count >= size:
-            return f"{count / size:.3g} {suffix}"
-    return f"{count:.0f}"
