@@ -106,7 +106,7 @@ def _closed(model: mujoco.MjModel, columns: np.ndarray, positions: np.ndarray) -
     """The same with the joints that no encoder measures where loops close, each instant from the one before."""
     joints = np.array(scalar_joints(model))
     free = np.setdiff1d(np.arange(len(joints)), columns)
-    loops = ClosedLoops.of_model(model, np.setdiff1d(np.arange(model.nv), model.jnt_dofadr[joints[free]]))
+    loops = ClosedLoops.of_model(model, np.setdiff1d(np.arange(model.nv), model.jnt_dofadr[joints[free]]).tolist())
     if loops is None:
         return positions
     result, posture, address = positions.copy(), model.qpos0.copy(), model.jnt_qposadr[joints]
