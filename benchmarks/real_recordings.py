@@ -27,6 +27,7 @@ from pace_optim.run.open import find_run
 from pace_optim.run.result import FitResult
 from pace_optim.run.settings import OPTIMIZERS, FitSettings
 from pace_optim.run.summary import summary
+from pace_optim.run.tensors import Trajectories
 from pace_optim.terminal.cli import run_cli
 
 SOURCE = Path(__file__).resolve().parents[2] / "shared" / "measurements"
@@ -104,7 +105,7 @@ def fit_command(args: argparse.Namespace) -> None:
     print(*summary(result), sep="\n")
     content = torch.load(folder / "best_trajectory.pt", weights_only=True)
     print("", *errors_table(content, result).split("\n"), sep="\n")
-    for name, figure in plot_trajectories(content, title=robot.name).items():
+    for name, figure in plot_trajectories(Trajectories.of(content), title=robot.name).items():
         figure.savefig(folder / f"{name}.png", dpi=PLOT_DPI)
     print(f"plots: {folder}")
     print(f"run: {folder}")

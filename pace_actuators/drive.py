@@ -109,12 +109,10 @@ class Drive(Part):
         self.effort_limit_sim = self.effort_limit.clone()
         self.velocity_limit = parameters.read("velocity_limit", velocity_limit)
         self.velocity_limit_sim = self.velocity_limit.clone()
-        if cfg.saturation_effort is None:
-            # no torque-speed line was asked for: a stall torque (finite) beyond all others and no fall with speed
-            self.saturation_effort = torch.full_like(self.effort_limit, torch.finfo(dtype).max)
-            self.velocity_limit = torch.full_like(self.velocity_limit, torch.inf)
-        else:
-            self.saturation_effort = parameters.read("saturation_effort", torch.inf)
+        # without a torque-speed line: a stall torque (finite) beyond all others and no fall with speed
+        stall = parameters.read("saturation_effort", torch.inf)
+        self.velocity_limit[stall.isinf()] = torch.inf
+        self.saturation_effort = stall.clamp(max=torch.finfo(dtype).max)
         self.encoder_bias = parameters.read("encoder_bias", 0.0)
         self.torque_enable: torch.Tensor | None = None
         self.holds_line = False

@@ -155,6 +155,11 @@ class IdentifiedDrives:
             return {}
         return {j: value for j, value in self.values(name, joints).items() if f"{name}/{j}" not in self.undetermined}
 
+    @property
+    def is_continuous(self) -> bool:
+        """Whether the controller of a drive ran continuously."""
+        return any(self.drive.get("implicit", {}).values())
+
     def find_joints(self, joint_names_expr: str | Sequence[str] | None) -> list[str]:
         """Its joints that match, in order; all for ``None``.
 
@@ -198,7 +203,12 @@ class IdentifiedDrives:
         return fields | self._rate_of(joints)
 
     def _rate_of(self, joints: Sequence[str]) -> dict[str, Any]:
-        """How the controllers of some joints ran: the same torque law needs the same rate."""
+        """How the controllers of some joints ran: the same torque law needs the same rate.
+
+        A result with a drive states all of it: what has no key is a loop that holds its torque for a control step.
+        """
+        if not self.drive:
+            return {}
         names = ("drive_dt", *RATE_FLAGS)
         rates = {tuple(self.drive.get(name, {}).get(joint) for name in names) for joint in joints}
         if len(rates) > 1:
@@ -206,9 +216,8 @@ class IdentifiedDrives:
                 f"{self.path}: the controllers of {', '.join(joints)} ran at different rates ({', '.join(names)}): "
                 f"{sorted(rates, key=str)}. Put them into separate groups."
             )
-        drive_dt, *flags = rates.pop() if rates else (None,)
-        rate = {} if drive_dt is None else {"drive_dt": drive_dt}
-        return rate | {name: True for name, flag in zip(RATE_FLAGS, flags, strict=False) if flag}
+        drive_dt, *flags = rates.pop()
+        return {"drive_dt": drive_dt, **{name: bool(flag) for name, flag in zip(RATE_FLAGS, flags, strict=True)}}
 
     def _effects_of(self, joints: Sequence[str], on_the_rig: bool) -> list[EffectCfg]:
         """The effects with their values on those of some joints that have them."""

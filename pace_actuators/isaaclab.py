@@ -17,7 +17,8 @@ What differs there, and is converted here:
   lifted in both (``joint_effort_limit``): the drive has limited its torque.
 - **Newton's actuators.** 3.0 with ``use_newton_actuators`` only runs actuators that USD can hold, and refuses this one:
   leave it off, or take what ``export --format newton`` writes.
-- **Effects that change friction at every step** need :class:`DriveFrictionMixin`.
+- **Drives that change friction at every step**, by an effect or a continuous loop (``implicit``), need
+  :class:`DriveFrictionMixin` and are refused without it.
 """
 
 from __future__ import annotations
@@ -55,7 +56,10 @@ class PaceDCMotorActuator(ActuatorBase):  # type: ignore[misc]
 
     Attributes:
         motor: The drive.
+        friction_is_written: Whether the articulation writes the drive's friction at every step.
     """
+
+    friction_is_written = False
 
     def __init__(
         self,
@@ -116,6 +120,11 @@ class PaceDCMotorActuator(ActuatorBase):  # type: ignore[misc]
     def compute(self, control_action: Any, joint_pos: torch.Tensor, joint_vel: torch.Tensor) -> Any:
         """Torques [N m] in ``joint_efforts``; targets are in the encoder's coordinates."""
         motor = self.motor
+        if motor.changes_passive and not self.friction_is_written:
+            raise ValueError(
+                "The drive changes the joints' friction at every physics step (its effects, or implicit=True): "
+                f"{ISAACLAB.friction_hook}."
+            )
         result = motor.compute(control_action, joint_pos, joint_vel)
         self.computed_effort, self.applied_effort = motor.computed_effort, motor.applied_effort
         return dataclasses.replace(result, joint_efforts=motor.held_effort)
@@ -180,7 +189,8 @@ def joint_parameters(motor: PaceDCMotorCfg) -> dict[str, Any]:
     names = _literal_names(motor.joint_names_expr)
     known = {name: value for name in CARRIED if (value := getattr(motor, name)) is not None}
     if names is not None:
-        alone = dataclasses.replace(motor, identified=None, physics_dt=motor.physics_dt or 1.0, delay=0.0, delay_s=None)
+        dt = motor.physics_dt or 1.0
+        alone = dataclasses.replace(motor, identified=None, physics_dt=dt, drive_dt=None, delay=0.0, delay_s=None)
         drive = (motor.class_type or PaceDCMotor)(alone, names, slice(None), 1)
         patterns = [re.escape(name) for name in names]
         found = {name: getattr(drive, f"joint_{name}")[0].tolist() for name in known}
@@ -228,7 +238,9 @@ class DriveFrictionMixin:
         return [each for each in actuators.values() if isinstance(each, PaceDCMotorActuator)]
 
     def _give_load(self, *held_by: Any) -> None:
-        """Give the drives the load on their joints."""
+        """Give the drives the load on their joints; their friction follows."""
+        for drive in self._drives:
+            drive.friction_is_written = True
         if any(drive.motor.needs_load for drive in self._drives):
             count = self.num_joints  # type: ignore[attr-defined]
             load = -sum(held() for held in held_by)[:, -count:]  # a floating base's own come first

@@ -32,6 +32,7 @@ from mjlab.utils.spec import create_motor_actuator, get_non_free_joints
 from pace_actuators.actions import ActuatorActions
 from pace_actuators.effects.fading_friction import solver_parameters, step_of_constraint
 from pace_actuators.identified import IdentifiedDrives
+from pace_actuators.joint_values import resolve_joint_values
 from pace_actuators.pace_dc_motor import PaceDCMotor
 from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
 from pace_actuators.representable import MJLAB, check_representable, refuse_inertia
@@ -137,9 +138,7 @@ class PaceDCMotorActuator(Actuator):  # type: ignore[misc]
         refuse_inertia(self.motor, MJLAB)
         self._model, self._data = model, data
         self._dofs = self.entity.indexing.joint_v_adr[self.target_ids]
-        bias = PaceDCMotor(
-            dataclasses.replace(self.cfg.motor, effects=(), delay_s=None), self._target_names, slice(None), 1
-        ).encoder_bias
+        bias = resolve_joint_values(self.cfg.motor.encoder_bias, self._target_names, field="encoder_bias")
         self._bias = bias.to(device)
         timeconst = 2 * dt if self.cfg.friction_timeconst is None else self.cfg.friction_timeconst
         impedance, soft = self.cfg.friction_impedance, self.motor.joint_friction_time
@@ -183,7 +182,7 @@ class PaceDCMotorActuator(Actuator):  # type: ignore[misc]
 
     def _make(self, num_envs: int, device: str, physics_dt: float, quiet: bool = False) -> PaceDCMotor:
         changes: dict[str, Any] = {"encoder_bias": 0.0, "physics_dt": physics_dt}
-        cfg = dataclasses.replace(self.cfg.motor, **changes | ({"identified": None} if quiet else {}))
+        cfg = dataclasses.replace(self.cfg.motor, **changes | ({"identified": None, "drive_dt": None} if quiet else {}))
         of_model: dict[str, Any] = {name: value.to(device) for name, value in self._of_model.items()}
         return (cfg.class_type or PaceDCMotor)(cfg, self._target_names, slice(None), num_envs, device, **of_model)
 

@@ -52,7 +52,7 @@ class PaceDCMotorCfg(Config):
     """Velocity gain kd [N m s/rad]; ``None`` takes what the constructor is given."""
 
     saturation_effort: JointValue | None = None
-    """Stall torque of the torque-speed curve [N m]; ``None`` means torque does not depend on speed."""
+    """Stall torque of the torque-speed curve [N m]; ``None``, or inf of a joint: torque does not depend on speed."""
 
     effort_limit: JointValue | None = None
     """Continuous torque limit [N m]; ``None`` takes what the constructor is given (default: no limit)."""
@@ -263,10 +263,7 @@ _DOMAINS: dict[str, tuple[Callable[[torch.Tensor], torch.Tensor], str]] = {
     "stiffness": _NOT_NEGATIVE,
     "damping": _NOT_NEGATIVE,
     **dict.fromkeys(CARRIED, _NOT_NEGATIVE),
-    "saturation_effort": (
-        lambda x: (x >= 0) & x.isfinite(),
-        "a finite number >= 0, or None for no torque-speed curve",
-    ),
+    "saturation_effort": (lambda x: x >= 0, "a number >= 0, or inf for no torque-speed curve"),
     "effort_limit": (lambda x: x >= 0, "a number >= 0, or inf"),
     "velocity_limit": (lambda x: x > 0, "a number > 0, or inf"),
     "encoder_bias": (torch.isfinite, "a finite number"),

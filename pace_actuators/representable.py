@@ -65,6 +65,10 @@ def check_representable(drives: IdentifiedDrives, world: World = HERE) -> list[s
             step, or MuJoCo's friction.
     """
     notes = [] if world.bodies else link_notes(drives)
+    if world.friction_hook and drives.is_continuous:
+        notes.append(
+            f"the drive's controller runs continuously (implicit), as friction of each step: {world.friction_hook}."
+        )
     for cfg in drives.effects:
         kind = cfg.effect_class
         if note := of_the_recording(kind):

@@ -112,6 +112,10 @@ class ClosedLoops:
             there, other = self._newton(there, self.passive)
         return there if other < gap else here
 
+    def nearest(self, qpos: np.ndarray) -> np.ndarray:
+        """The posture (nq,) with its passive joints as near to closing the loops as they come from where they are."""
+        return self._newton(qpos, self.passive)[0]
+
     def _off_their_stops(self, qpos: np.ndarray, near: float = 0.0) -> np.ndarray:
         """Passive degrees of freedom without those of joints that lean on a stop: they stay there if loops let them.
 

@@ -17,8 +17,10 @@ t up to the units. In the file s = 0. J is linear in the torque, and bodies that
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -148,8 +150,14 @@ class Reference:
         )
 
 
-def write_links(spec: mujoco.MjSpec, links: Mapping[str, LinkInertia], source: object) -> None:
-    """Give bodies of a model that is to be compiled other inertial parameters."""
+def write_links(spec: mujoco.MjSpec, model: mujoco.MjModel, links: Mapping[str, LinkInertia], source: object) -> None:
+    """Give bodies of a model that is to be compiled other inertial parameters.
+
+    Args:
+        model: The model as it is compiled before that.
+    """
+    if links:
+        state_inertias(spec, model)
     names = [body.name for body in spec.bodies[1:]]
     for name, link in links.items():
         if name not in names:
@@ -159,9 +167,33 @@ def write_links(spec: mujoco.MjSpec, links: Mapping[str, LinkInertia], source: o
         moments, axes = np.linalg.eigh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         turn = np.zeros(4)
         mujoco.mju_mat2Quat(turn, (axes * [np.linalg.det(axes), 1.0, 1.0]).ravel())
-        body.explicitinertial = True
-        body.mass, body.ipos = link.mass, link.com
-        body.inertia, body.iquat, body.fullinertia = moments, turn, np.full(6, np.nan)
+        state_inertia(body, link.mass, link.com, moments, turn)
+
+
+def state_inertia(body: mujoco.MjsBody, mass: float, com: Any, moments: Any, quat: Any) -> None:
+    """Write a body's mass, centre of mass, principal moments and their axes, instead of the present ones."""
+    body.explicitinertial = True
+    body.mass, body.ipos = mass, com
+    body.inertia, body.iquat, body.fullinertia = moments, quat, np.full(6, np.nan)
+
+
+def state_inertias(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+    """State the compiled inertias where a file has MuJoCo take those of geoms, or scale all to a total mass.
+
+    Such a file ignores what is written into a body.
+    """
+    compiler = spec.compiler
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # MuJoCo 4.0: settotalmass will be removed
+        total = getattr(compiler, "settotalmass", 0.0)
+        if compiler.inertiafromgeom != mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE and not total > 0:
+            return
+        if total > 0:
+            compiler.settotalmass = -1.0
+    compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+    for body in spec.bodies[1:]:
+        own = model.body(body.id)
+        state_inertia(body, float(own.mass[0]), own.ipos, own.inertia, own.iquat)
 
 
 class LinkInertias:

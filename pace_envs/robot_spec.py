@@ -45,7 +45,7 @@ def load_robot_spec(cfg: ArticulationCfg, *, touches: bool = False) -> mujoco.Mj
         for note in file.notes:
             warnings.warn(f"{cfg.mjcf_path}: {note}", stacklevel=2)
         _name_geoms(spec)
-    write_links(spec, cfg.links, cfg.mjcf_path)
+    write_links(spec, model, cfg.links, cfg.mjcf_path)
     free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
     if cfg.fix_base:
         for joint in free:

@@ -265,10 +265,14 @@ class RobotState:
         slides = self.slide_joints
         return tuple("slide" if name in slides else "hinge" for name in self.joint_names)
 
-    def site_pose(self, name: str | None) -> torch.Tensor:
-        """Pose of a site, or of a body, in the frame of the robot's base, as the state is now.
+    @property
+    def base_id(self) -> int:
+        """Model index of the robot's base: its first body; where a joint moves that one on the world, the world."""
+        first = self._body_ids[0]
+        return 0 if self._sim.model.body_jntnum[first] and self.is_fixed_base else first
 
-        The base is the first body; where a joint moves that one on the world, it is the world.
+    def site_pose(self, name: str | None) -> torch.Tensor:
+        """Pose of a site, or of a body, in the frame of the robot's base (``base_id``), as the state is now.
 
         Args:
             name: The site's name, or the body's.
@@ -285,9 +289,7 @@ class RobotState:
                 f"{', '.join(sites) or 'no site'}; bodies {', '.join(bodies)}. Name one in PaceCfg.ee_site, or in "
                 "reach_env_cfg."
             )
-        first = self._body_ids[0]
-        is_jointed = bool(model.body_jntnum[first]) and self.is_fixed_base
-        base = 0 if is_jointed else first
+        base = self.base_id
         quat, place, sites_at = (sim.bind(field) for field in ("xquat", "xpos", "site_xpos"))
         sim.forward()  # fills what is bound
         if name in sites:

@@ -37,8 +37,9 @@ from pace_envs import (
 
 HERE = Path(__file__).parent
 
-# Units of hinges; a slide has m for rad, N for N m, kg for kg m^2. The last four are the largest values to be tried:
-# kp, kd, effort limit, speed limit, centre and amplitude of the motion, armature, viscous, friction, encoder bias
+# Units of hinges; a slide has m for rad, N for N m, kg for kg m^2. The last five bound the search:
+# kp, kd, effort limit, speed limit, centre and amplitude of the motion; least and largest armature, and the largest
+# viscous friction, friction and encoder bias
 JOINTS = _JOINTS_
 HOME = _HOME_
 LONGEST_DELAY = _DELAY_  # [control steps]
@@ -47,7 +48,8 @@ LONGEST_DELAY = _DELAY_  # [control steps]
 def env_cfg() -> PaceSim2realEnvCfg:
     """The identification environment."""
     names = tuple(JOINTS)
-    kp, kd, effort, speed, centre, amplitude, armature, viscous, friction, bias = map(list, zip(*JOINTS.values()))
+    kp, kd, effort, speed, centre, amplitude, *bounded = map(list, zip(*JOINTS.values()))
+    least, armature, viscous, friction, bias = bounded
     drives = PaceDCMotorCfg(
         joint_names_expr=[re.escape(name) for name in names],
         stiffness=kp,
@@ -70,7 +72,7 @@ def env_cfg() -> PaceSim2realEnvCfg:
         couplings=_COUPLINGS_,
     )
     bounds = {
-        "armature": [(1e-5 * most, most) for most in armature],
+        "armature": list(zip(least, armature, strict=True)),
         "viscous_friction": [(0.0, most) for most in viscous],
         "friction": [(0.0, most) for most in friction],
         "encoder_bias": [(-most, most) for most in bias],
@@ -129,6 +131,7 @@ def configuration_text(
     for i, name in enumerate(names):
         values = [_of(drive.stiffness, i), _of(drive.damping, i), _of(drive.effort_limit, i)]
         values += [_of(drive.velocity_limit, i), excitation.bias[i] * excitation.scale[i], excitation.scale[i]]
+        values.append(float(sim2real.bounds["armature"][i, 0]))
         rows[name] = tuple(_number(v) for v in [*values, *upper[:, i].tolist()])
     task = f"Pace-{''.join(word.capitalize() for word in sim2real.robot_name.replace('-', '_').split('_'))}-v0"
     home = robot.init_state.joint_pos if isinstance(robot.init_state.joint_pos, dict) else {}

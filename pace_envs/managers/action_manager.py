@@ -50,6 +50,10 @@ class ActionTerm:
     def reset(self, env_ids: torch.Tensor) -> None:
         """Forget the state of some environments."""
 
+    def describe(self) -> dict[str, Any]:
+        """What the numbers that it takes mean, for ``policy.json``."""
+        return {}
+
 
 class ActionManager(ClassTerms[ActionTerm]):
     """Splits the action among its terms."""

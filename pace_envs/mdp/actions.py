@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from pace_actuators import JointValue, resolve_joint_values
+from pace_actuators.joint_units import units_for
 from pace_envs.managers import ActionTerm, ActionTermCfg
 
 if TYPE_CHECKING:
@@ -18,6 +19,7 @@ class JointPositionAction(ActionTerm):
     """Joint position targets: q* = scale * action + offset, both (num_joints,) [rad]."""
 
     cfg: JointPositionActionCfg
+    meaning = "target = action * scale + offset, in the encoder's coordinates [rad]"
 
     def __init__(self, cfg: JointPositionActionCfg, env: ManagerBasedEnv):
         """Find the joints, their scales and offsets."""
@@ -36,6 +38,16 @@ class JointPositionAction(ActionTerm):
     def action_dim(self) -> int:
         """Number of joints."""
         return len(self.joint_names)
+
+    def describe(self) -> dict[str, Any]:
+        """Its joints, and what it makes of the action."""
+        types = dict(zip(self._asset.joint_names, self._asset.joint_types, strict=True))
+        return {
+            "joint_names": self.joint_names,
+            "target": units_for(self.meaning, [types[name] for name in self.joint_names]),
+            "scale": self.scale.tolist(),
+            "offset": self.offset.tolist(),
+        }
 
     def process_actions(self, actions: torch.Tensor) -> None:
         """Scale and offset."""
@@ -72,6 +84,8 @@ class JointPositionActionCfg(ActionTermCfg):
 class JointVelocityAction(JointPositionAction):
     """Joint velocity targets: q̇* = scale * action + offset [rad/s]. Drives without stiffness follow them alone."""
 
+    meaning = "speed target = action * scale + offset [rad/s]"
+
     def apply_actions(self) -> None:
         """Set the joints' velocity targets."""
         self._asset.set_joint_velocity_target(self.processed_actions, self._joint_ids)
@@ -90,6 +104,8 @@ class JointVelocityActionCfg(JointPositionActionCfg):
 
 class JointEffortAction(JointPositionAction):
     """Torques, added to what the drives' controllers ask for: τ_ff = scale * action + offset [N m]."""
+
+    meaning = "torque beside the controller's = action * scale + offset [N m]"
 
     def apply_actions(self) -> None:
         """Set the joints' feed-forward torques."""

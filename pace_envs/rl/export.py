@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from pace_actuators.files import write_together
-from pace_envs.mdp import JointPositionAction
 from pace_envs.rl.runner import PaceOnPolicyRunner
 
 EXPORTED = "exported"
@@ -42,22 +41,24 @@ def export_policy(runner: PaceOnPolicyRunner, folder: Path) -> None:
             log.setLevel(level)
         policy = Path(made, "policy.pt").read_bytes()
         network = onnx.load_model(Path(made, "policy.onnx")).SerializeToString()  # the weights inside
-    text = json.dumps(_describe(runner), indent=2) + "\n"
+    text = json.dumps(describe_policy(runner), indent=2) + "\n"
     folder.mkdir(parents=True, exist_ok=True)
     write_together(dict(zip(exported_files(folder), (policy, network, text.encode()), strict=True)))
 
 
-def _describe(runner: PaceOnPolicyRunner) -> dict[str, Any]:
+def describe_policy(runner: PaceOnPolicyRunner) -> dict[str, Any]:
+    """What a policy's numbers mean; those of several action terms by their names, in the order of the action."""
     env = runner.env.unwrapped
     robot = env.scene["robot"]
     terms = []
     for name, (term, dim) in env.observation_manager.group_terms("policy").items():
         terms.append({"name": name, "dim": dim, "scale": 1.0 if term.scale is None else term.scale})
-    action = env.action_manager.get_term("joint_pos")
-    described: dict[str, Any] = {"version": 1, "step_dt": env.step_dt, "observations": terms}
-    if isinstance(action, JointPositionAction):
-        described["joint_names"] = action.joint_names
-        described["target"] = "target = action * scale + offset, in the encoder's coordinates [rad]"
-        described["scale"], described["offset"] = action.scale.tolist(), action.offset.tolist()
-    described["default_joint_pos"] = robot.data.default_joint_pos[0].tolist()
-    return described
+    manager = env.action_manager
+    actions = {name: manager.get_term(name).describe() for name in manager.active_terms}
+    return {
+        "version": 1,
+        "step_dt": env.step_dt,
+        "observations": terms,
+        **(next(iter(actions.values())) if len(actions) == 1 else {"actions": actions}),
+        "default_joint_pos": robot.data.default_joint_pos[0].tolist(),
+    }

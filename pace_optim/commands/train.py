@@ -52,15 +52,14 @@ def main() -> None:
 
 
 def _task_for(identified: str | None) -> str:
-    """The task in which the robot of a fit walks."""
-    walking = [task for task in registered_tasks() if "-Velocity-" in task]
+    """The task in which the robot of a fit walks or reaches."""
+    known = [task for task in registered_tasks() if "-Velocity-" in task or "-Reach-" in task]
     if identified is None:
-        raise ValueError(f"--task is missing. Available: {', '.join(walking)}, or a task of yours (module:Task).")
+        raise ValueError(f"--task is missing. Available: {', '.join(known)}, or a task of yours (module:Task).")
     fitted = IdentifiedDrives.load(identified).task
-    task = fitted.replace("-v0", "-Velocity-v0")
-    if task not in walking:
-        raise ValueError(
-            f"{identified} is a fit of {fitted}, which has no task to train in. Available: {', '.join(walking)}, or a "
-            "task of yours: --task module:Task or FILE.py:Task."
-        )
-    return task
+    if task := next((task for task in known if task.startswith(fitted.removesuffix("v0"))), None):
+        return task
+    raise ValueError(
+        f"{identified} is a fit of {fitted}, which has no task to train in. Available: {', '.join(known)}, or a task "
+        "of yours: --task module:Task or FILE.py:Task."
+    )

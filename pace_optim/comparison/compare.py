@@ -13,7 +13,7 @@ import numpy as np
 
 from pace_actuators.files import write_together
 from pace_actuators.joint_units import joint_label, units_for
-from pace_actuators.text import aligned, in_short, listed, percent, position_unit, shortened, three_figures
+from pace_actuators.text import aligned, in_short, listed, percent, position_unit, shortened
 from pace_optim.recording.noise import noise_floor
 from pace_optim.report import check_folder, report_text
 from pace_optim.run.open import run_folder
@@ -22,7 +22,7 @@ from pace_optim.run.tensors import held_out_spans
 
 from .error_regions import AT_THE_FLOOR, NEGLIGIBLE, worst_places
 from .joint import JointComparison, compare_joint, place_content, rmse_by_part
-from .ladder import check_alike, ladder_table, make_ladder
+from .ladder import cell, check_alike, ladder_table, make_ladder
 from .tracks import RunTracks, Track, load_tracks
 
 VERSION = 1
@@ -96,7 +96,7 @@ def compare_run(run: RunTracks) -> dict[str, Any]:
         "physics_dt": run.physics_dt,
         "data": list(run.data),
         "joint_names": list(joints),
-        "summary": " ".join(filter(None, [_summary(compared), _carried(joints, compared)])),
+        "summary": " ".join(filter(None, [summary_of(compared), _carried(joints, compared)])),
         "worst_places": [place_content(place) for place in worst],
         "rmse": rmse_by_part(run.tracks),
         "noise_floor": float(np.sqrt(np.mean(np.square(floors)))),
@@ -136,11 +136,11 @@ def _unrepeatable(joints: Sequence[str], compared: Sequence[JointComparison], tr
     ]
 
 
-def _summary(compared: Sequence[JointComparison]) -> str:
+def summary_of(compared: Sequence[JointComparison]) -> str:
     """How many joints are explained, in a sentence or two."""
     count = len(compared)
-    done = sum(_explained(joint.content) for joint in compared)
-    spread = sum(not _explained(joint.content) and not joint.places for joint in compared)
+    done = sum(joint.is_explained for joint in compared)
+    spread = sum(not joint.is_explained and not joint.places for joint in compared)
     if done == count:
         which, near = "The joint is" if count == 1 else f"All {count} joints are", 100 * (AT_THE_FLOOR - 1)
         return f"{which} within {near:.0f} % of the noise: a better model could explain little more of this data."
@@ -159,11 +159,6 @@ def _summary(compared: Sequence[JointComparison]) -> str:
 def _carried(joints: Sequence[str], compared: Sequence[JointComparison]) -> str:
     """Which few joints hold nearly all of the squared error; "" where many do."""
     return carried_by({joint: max(own.content["rmse"].values()) for joint, own in zip(joints, compared, strict=True)})
-
-
-def _explained(content: dict[str, Any]) -> bool:
-    rmse = content["noise_floor"] / max(1 - content["share_above_floor"], 1e-12) ** 0.5
-    return rmse <= AT_THE_FLOOR * content["noise_floor"] or max(content["rmse"].values()) < NEGLIGIBLE
 
 
 def plain(content: Any) -> Any:
@@ -195,8 +190,8 @@ def comparison_lines(content: dict[str, Any]) -> list[str]:
     labels = [joint_label(name, own, types, unit) for name, own in zip(joints, types, strict=True)]
     names, pattern = in_short(labels)
     columns = [[f"joint {pattern}".strip(), *names]]
-    columns += [[part, *(_cell(j["rmse"].get(part), factor) for j in joints.values())] for part in parts]
-    columns += [["noise", *(_cell(joint["noise_floor"], factor) for joint in joints.values())]]
+    columns += [[part, *(cell(j["rmse"].get(part), factor) for j in joints.values())] for part in parts]
+    columns += [["noise", *(cell(joint["noise_floor"], factor) for joint in joints.values())]]
     columns += [["above noise", *(percent(joint["share_above_floor"]) for joint in joints.values())]]
     head, *rows = aligned(columns)
     lines = [f"{head}   [{units_for(unit, types)}]"]
@@ -227,10 +222,6 @@ def _split(content: dict[str, Any], factor: float, name: str, labels: Sequence[s
         values = {joint: rms[i] for joint, rms in found.items()}
         worst = max(values, key=lambda joint: values[joint])
         whole = math.sqrt(sum(value**2 for value in values.values()) / len(values))
-        rows.append([label, _cell(whole, factor), _cell(values[worst], factor), worst])
+        rows.append([label, cell(whole, factor), cell(values[worst], factor), worst])
     *numbers, worst_joints = zip(*rows, strict=True)
     return ["", *(f"{row}  {joint}".rstrip() for row, joint in zip(aligned(numbers), worst_joints, strict=True))]
-
-
-def _cell(value: float | None, factor: float) -> str:
-    return "–" if value is None else three_figures(factor * value)

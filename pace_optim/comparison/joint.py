@@ -14,7 +14,7 @@ from pace_optim.recording.noise import NoiseFloor, noise_floor, with_repetitions
 from pace_optim.run.tensors import rms
 
 from .dimensions import Dimension, Motion, dimensions_of, motion_of
-from .error_regions import Place, joint_sentence, places_of
+from .error_regions import AT_THE_FLOOR, NEGLIGIBLE, Place, joint_sentence, places_of
 from .regions import lay_out
 from .tracks import Track
 from .words import band_text
@@ -231,6 +231,8 @@ class JointComparison:
     """For comparison.json."""
     places: list[Place]
     """Where its error sits; empty at the noise floor."""
+    is_explained: bool
+    """Whether a better model could explain little more."""
 
 
 def compare_joint(joint: str, j: int, tracks: Sequence[Track], joint_type: JointType = "hinge") -> JointComparison:
@@ -297,7 +299,8 @@ def compare_joint(joint: str, j: int, tracks: Sequence[Track], joint_type: Joint
                 "over_time": over_time(track.time, whole),
             }
         )
-    return JointComparison(content=content, places=told)
+    is_explained = total < NEGLIGIBLE or total <= AT_THE_FLOOR * floor
+    return JointComparison(content=content, places=told, is_explained=is_explained)
 
 
 def noise_floors(j: int, tracks: Sequence[Track]) -> list[NoiseFloor]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from pace_actuators.drive_result import ALL
 from pace_actuators.joint_units import JointType
-from pace_actuators.text import position_unit, three_figures
+from pace_actuators.text import aligned, position_unit, three_figures
 from pace_optim.run.tensors import rms
 
 from .joint import noise_floors, rmse_by_part
@@ -83,13 +83,11 @@ def ladder_table(ladder: dict[str, Any], joint_types: Sequence[JointType]) -> li
     factor, unit = position_unit([s["rmse"][part].get(ALL) for s in steps for part in _PARTS], joint_types)
     rows = [["", *(f"{part} [{unit}]" for part in _PARTS), "× better (train, validation)"]]
     for step in steps:
-        values = [_cell(step["rmse"][part].get(ALL), factor) for part in _PARTS]
+        values = [cell(step["rmse"][part].get(ALL), factor) for part in _PARTS]
         ratio = [f"{step['ratio_to_previous'][part]:.2f}" for part in _PARTS if part in step["ratio_to_previous"]]
         rows.append([step["name"], *values, ", ".join(ratio)])
-    rows.append(["noise floor", *[_cell(floor, factor)] * 2, ""])
-    widths = [max(len(row[c]) for row in rows) for c in range(len(rows[0]))]
-    cells = ([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])] for row in rows)
-    return ["  ".join(row).rstrip() for row in cells]
+    rows.append(["noise floor", *[cell(floor, factor)] * 2, ""])
+    return [row.rstrip() for row in aligned(list(zip(*rows, strict=True)))]
 
 
 def _floor(j: int, tracks: Sequence[Track]) -> float:
@@ -114,5 +112,6 @@ def _rmse_by_joint(run: RunTracks, part: str) -> dict[str, float]:
     return {j: rmse_by_part(run.tracks, i)[part] for i, j in enumerate(run.result.joint_names)} | {ALL: every[part]}
 
 
-def _cell(value: float | None, factor: float) -> str:
+def cell(value: float | None, factor: float) -> str:
+    """A number of a table in its unit; a dash for none."""
     return "–" if value is None else three_figures(factor * value)

@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
 
-from pace_envs.task_source import file_digest
 from pace_optim.estimate.error_bars.assessment import trajectories
 from pace_optim.problem.evaluator import Evaluator
 from pace_optim.problem.problem import Problem
@@ -18,8 +15,7 @@ from pace_optim.recording import Drive, Recording
 from pace_optim.recording.carried import part_of_phase
 from pace_optim.run.open import open_problem
 from pace_optim.run.result import FitResult
-from pace_optim.run.settings import FitSettings
-from pace_optim.run.tensors import read_trajectory
+from pace_optim.run.tensors import RecordingData, Trajectories, read_trajectory
 
 from .drive_loads import load_torques
 
@@ -125,35 +121,36 @@ def load_tracks(
     if simulate and problem is not None:
         evaluator = replace(problem, device=device).evaluator()
         physical = problem.space.from_dict(result.parameters)
-        content = trajectories(problem, evaluator.residuals(physical[None], problem.dataset.sampled))
+        own = Trajectories.of(trajectories(problem, evaluator.residuals(physical[None], problem.dataset.sampled)))
     else:
-        content = read_trajectory(folder)
-    _check_finite(folder if simulate else folder / "best_trajectory.pt", content)
+        own = read_trajectory(folder)
+    simulated = own.recordings
+    _check_finite(folder if simulate else folder / "best_trajectory.pt", simulated)
     recordings = None if problem is None else problem.dataset.recordings
-    if recordings is not None and not _are_those(recordings, content):
+    if recordings is not None and not _are_those(recordings, simulated):
         notes.append("The run's recordings have changed since it was fitted: there is no load torque.")
         recordings = problem = None
     loads: list[np.ndarray] | None = None
     if problem is not None:
         bias = np.array([result.parameters["encoder_bias"][name] for name in problem.joint_names])
         loads = load_torques(Evaluator(problem.make_env, problem.dataset, problem.space), bias)
-    groups = _groups(content["recordings"], recordings)
-    trained = _trained_before(folder, data)
+    groups = _groups(simulated, recordings)
+    before = read_trajectory(folder).recordings if data and (folder / "best_trajectory.pt").is_file() else ()
     tracks = tuple(
         Track(
-            name=entry["name"],
-            time=np.asarray(entry["time"]),
-            target=np.asarray(entry["des_dof_pos"]),
-            measured=np.asarray(entry["dof_pos"]),
-            error=np.asarray(entry["sim_dof_pos"]) - np.asarray(entry["dof_pos"]),
-            train=trained[r] if trained and len(trained[r]) == len(entry["time"]) else _train(entry, bool(data)),
+            name=each.name,
+            time=each.time,
+            target=each.target,
+            measured=each.measured,
+            error=each.error,
+            train=_trained(each, before) if data else each.train,
             load=None if loads is None else loads[r],
-            enabled=_enabled(entry),
+            enabled=each.enabled,
             group=groups[r],
-            swing=None if problem is None else _swing(problem, r, len(entry["time"])),
-            settling=np.asarray(entry["settling"]) if "settling" in entry else None,
+            swing=None if problem is None else _swing(problem, r, len(each.time)),
+            settling=~each.train & ~each.held_out,
         )
-        for r, entry in enumerate(content["recordings"])
+        for r, each in enumerate(simulated)
     )
     return RunTracks(
         folder=folder,
@@ -174,67 +171,48 @@ def _swing(problem: Problem, r: int, count: int) -> np.ndarray | None:
     return parts[recording.sample_steps[:count]]
 
 
-def _check_finite(source: Path, content: dict[str, Any]) -> None:
-    for entry in content["recordings"]:
-        if not bool(torch.as_tensor(entry["sim_dof_pos"]).isfinite().all()):
+def _check_finite(source: Path, simulated: Sequence[RecordingData]) -> None:
+    for each in simulated:
+        if not np.isfinite(each.simulated).all():
             raise ValueError(
-                f"{source}: the simulation of {entry['name']} diverges with the run's parameters, so there is nothing "
+                f"{source}: the simulation of {each.name} diverges with the run's parameters, so there is nothing "
                 "to compare. Fit again, with narrower bounds or a finer --physics_dt."
             )
 
 
-def _are_those(recordings: Sequence[Recording], content: dict[str, Any]) -> bool:
+def _are_those(recordings: Sequence[Recording], simulated: Sequence[RecordingData]) -> bool:
     """Whether files read again hold what the run was fitted to."""
-    entries = content["recordings"]
-    return len(recordings) == len(entries) and all(
-        r.dof_pos.shape == tuple(entry["dof_pos"].shape)
-        and np.allclose(r.dof_pos, entry["dof_pos"], rtol=0, atol=_SAME)
-        for r, entry in zip(recordings, entries, strict=True)
+    return len(recordings) == len(simulated) and all(
+        _are_same(one.dof_pos, other.measured) for one, other in zip(recordings, simulated, strict=True)
     )
 
 
-def _train(entry: dict[str, Any], others: bool) -> np.ndarray:
-    train = np.asarray(entry["train"]).astype(bool)
-    return np.zeros_like(train) if others else train
+def _are_same(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two recordings' positions are the same."""
+    return one.shape == other.shape and np.allclose(one, other, rtol=0, atol=_SAME)
 
 
-def _enabled(entry: dict[str, Any]) -> np.ndarray:
-    """When the drive gave torque; runs of earlier versions do not say it."""
-    if "torque_enable" in entry:
-        return np.asarray(entry["torque_enable"]).astype(bool)
-    return np.ones(len(entry["time"]), dtype=bool)
+def _trained(one: RecordingData, before: Sequence[RecordingData]) -> np.ndarray:
+    """Which samples of a recording a run was trained on: those of the same one among its own recordings."""
+    same = (own.train for own in before if _are_same(one.measured, own.measured))
+    return next(same, np.zeros_like(one.train))
 
 
-def _trained_before(folder: Path, data: Sequence[str]) -> list[np.ndarray]:
-    """For files named anew, which samples the run was trained on: those of the run's recordings, by their digests."""
-    if not data or not (folder / "best_trajectory.pt").is_file():
-        return []
-    digests = FitSettings.load(folder / "settings.json")[1].digests  # in the order of the recordings
-    entries = read_trajectory(folder)["recordings"]
-    if len(digests) != len(entries):
-        return []
-    known = {
-        digest: np.asarray(entry["train"]).astype(bool) for digest, entry in zip(digests.values(), entries, strict=True)
-    }
-    return [known.get(file_digest(path), np.zeros(0, dtype=bool)) for path in data]
-
-
-def _groups(entries: Sequence[dict[str, Any]], recordings: Sequence[Recording] | None) -> list[int]:
+def _groups(simulated: Sequence[RecordingData], recordings: Sequence[Recording] | None) -> list[int]:
     """A number for each recording; the same number for those that repeat each other."""
     result: list[int] = []
-    for r, entry in enumerate(entries):
-        twin = next((s for s in range(r) if _repeats(entry, entries[s]) and _alike(recordings, r, s)), None)
+    for r, one in enumerate(simulated):
+        twin = next((s for s in range(r) if _repeats(one, simulated[s]) and _alike(recordings, r, s)), None)
         result.append(r if twin is None else result[twin])
     return result
 
 
-def _repeats(one: dict[str, Any], other: dict[str, Any]) -> bool:
-    length = min(len(one["time"]), len(other["time"]))
-    if max(len(one["time"]), len(other["time"])) > 1.02 * length + 1:
+def _repeats(one: RecordingData, other: RecordingData) -> bool:
+    length = min(len(one.time), len(other.time))
+    if max(len(one.time), len(other.time)) > 1.02 * length + 1:
         return False
-    return all(
-        np.allclose(one[key][:length], other[key][:length], rtol=0, atol=1e-6) for key in ("time", "des_dof_pos")
-    )
+    pairs = ((one.time, other.time), (one.target, other.target))
+    return all(np.allclose(a[:length], b[:length], rtol=0, atol=1e-6) for a, b in pairs)
 
 
 def _alike(recordings: Sequence[Recording] | None, r: int, s: int) -> bool:

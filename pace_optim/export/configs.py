@@ -101,10 +101,6 @@ ACTUATORS = {name: PaceDCMotorActuatorCfg(motor=motor) for name, motor in MOTORS
 def _page(drives: IdentifiedDrives, world: World, template: str, extra: Mapping[str, Any]) -> tuple[str, list[str]]:
     notes = [_DELAY.format(dt=1e3 * drives.at.physics_dt), *check_representable(drives, world)]
     notes += [*(link_notes(drives) if world is HERE else []), *extra_notes(drives)]
-    if world.friction_hook and _is_implicit(drives):
-        notes.append(
-            f"the drive's controller runs continuously (implicit), as friction of each step: {world.friction_hook}."
-        )
     motors = {group: _call(cfg, extra) for group, cfg in drive_groups(drives).items()}
     values = {"_ABOUT_": about(drives, "", notes), "_MOTORS_": motors, "_PHYSICS_DT_": drives.at.physics_dt}
     return python_page(template, values), notes
@@ -131,14 +127,10 @@ def extra_notes(drives: IdentifiedDrives) -> list[str]:
     ]
 
 
-def _is_implicit(drives: IdentifiedDrives) -> bool:
-    return any(cfg.implicit for cfg in drive_groups(drives).values())
-
-
 def _changes_friction(drives: IdentifiedDrives) -> bool:
     kinds = [effect.effect_class for effect in drives.effects]
     stages = ("feedback", "friction", "transmission")
-    return _is_implicit(drives) or any(kind.overrides(stage) for kind in kinds for stage in stages)
+    return drives.is_continuous or any(kind.overrides(stage) for kind in kinds for stage in stages)
 
 
 def _call(cfg: PaceDCMotorCfg, extra: Mapping[str, Any]) -> Call:

@@ -19,6 +19,7 @@ from pace_actuators.effects.command import GravityCompensation
 from pace_actuators.text import listed
 from pace_envs import ManagerBasedRLEnv
 from pace_envs.identified import load_identified_cfg, use_identified
+from pace_envs.link_inertia import FIELDS, state_inertia, state_inertias
 from pace_envs.model_file import compile_model, missing_files, read_model_file
 from pace_envs.motor_coordinates import DrivenJoints, add_motors
 from pace_envs.robot_spec import load_robot_spec
@@ -35,7 +36,11 @@ from pace_optim.export.plain_drive import (
     soft_frictions,
 )
 
-_BODY_FIELDS = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat")
+_BODY_FIELDS = (*FIELDS, "body_pos", "body_quat")
+
+
+_SAME_GRAVITY = 0.05
+"""Largest difference of two values of the same gravity [m/s²]."""
 
 
 def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, list[str]]:
@@ -55,6 +60,7 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
     spec, left_out = model_of(source)
     couplings = cfg.scene.robot.couplings
     add_motors(spec, couplings, source)
+    of_the_fit = _as_in_the_fit(spec, cfg)
     driven = int(robot.dof_columns[0])
     for element in [*spec.joints, *spec.tendons]:  # what has no drive rubs as in the fit too
         element.solref_friction, element.solimp_friction = model.dof_solref[driven], model.dof_solimp[driven]
@@ -67,7 +73,7 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
     if spec.meshes:
         spec.meshdir = str((source.parent / spec.meshdir).resolve())
-    changed = _write_bodies(spec, plain, env)
+    changed = _write_bodies(spec, source, plain, env)
     weights = dict(zip(robot.joint_names, env.sim.friction_weights(robot.dof_columns)[0].tolist(), strict=True))
     env.close()
     plain.close()
@@ -84,8 +90,19 @@ def mjcf(drives: IdentifiedDrives, *, joints_only: bool = False) -> tuple[str, l
     _write_soft_friction(spec, source, drives, weights, actuators)
     if changed:
         notes.append(f"changed rigid bodies, which are in the model: {', '.join(changed)}.")
-    notes += [*effect_notes(drives, held), *left_out]
+    notes += [*of_the_fit, *effect_notes(drives, held), *left_out]
     return _with_comment(spec, notes, drives, joints_only), notes
+
+
+def _as_in_the_fit(spec: mujoco.MjSpec, cfg: Any) -> list[str]:
+    """Let gravity be the fit's; returns how the fit's rig differs from the file, in words."""
+    notes, gravity = [], np.array(cfg.sim.gravity)
+    if np.abs(spec.option.gravity - gravity).max() > _SAME_GRAVITY:
+        notes.append(f"gravity is that of the fit, {gravity.tolist()} m/s²; the model file has another.")
+    spec.option.gravity = gravity
+    if held := [f"{name} at {position:.4g}" for name, position in cfg.scene.robot.held_joints.items()]:
+        notes.append(f"held in the fit, free here: {', '.join(held)} [rad, of slides m].")
+    return notes
 
 
 def _compensated(spec: mujoco.MjSpec, drives: IdentifiedDrives, notes: list[str]) -> list[str]:
@@ -228,20 +245,21 @@ def _set(joint: Any, attribute: str, value: float) -> None:
         setattr(joint, attribute, value)
 
 
-def _write_bodies(spec: mujoco.MjSpec, plain: ManagerBasedRLEnv, env: ManagerBasedRLEnv) -> list[str]:
+def _write_bodies(spec: mujoco.MjSpec, source: Path, plain: ManagerBasedRLEnv, env: ManagerBasedRLEnv) -> list[str]:
     """Write the rigid bodies that effects have changed; returns their names."""
-    model, changed = env.sim.model, []
+    model = env.sim.model
+    changed: list[str] = []
     for b in range(1, model.nbody):
         before = {field: plain.sim.expand(field)[0, b] for field in _BODY_FIELDS}
         after = {field: env.sim.expand(field)[0, b] for field in _BODY_FIELDS}
         if all(torch.allclose(before[f], after[f], rtol=1e-12, atol=1e-15) for f in _BODY_FIELDS):
             continue
+        if not changed:
+            state_inertias(spec, compile_model(spec, source))
         body = spec.body(model.body(b).name)
         changed.append(body.name)
-        body.explicitinertial = True
-        body.mass = float(after["body_mass"])
-        body.inertia, body.fullinertia = after["body_inertia"].numpy(), np.full(6, np.nan)
-        body.ipos, body.iquat = after["body_ipos"].numpy(), after["body_iquat"].numpy()
+        mass, com, moments, quat = (after[field].numpy() for field in FIELDS)
+        state_inertia(body, float(mass), com, moments, quat)
         for field, attribute in (("body_pos", "pos"), ("body_quat", "quat")):
             if not torch.equal(before[field], after[field]):
                 setattr(body, attribute, after[field].numpy())

@@ -128,7 +128,7 @@ def _expression(joint: str) -> str:
 def _notes(drives: IdentifiedDrives, plain: Mapping[str, PlainDrive]) -> list[str]:
     dt, notes = drives.at.physics_dt, whole_steps_note(drives, plain)
     most = max((abs(drive.encoder_bias) for drive in plain.values()), default=0.0)
-    notes.append(f"encoder bias (up to {most:.3g} rad): add EVENTS to the environment's events.")
+    notes.append(f"encoder bias (up to {most:.3g} rad, of slides m): add EVENTS to the environment's events.")
     notes.append("Coulomb friction is soft by default: call write_joints(spec) in your spec_fn, for springs too.")
     if drives.command_timing is not None and drives.command_timing.lost > 0:
         notes.append(f"{100 * drives.command_timing.lost:.2g} % of the commands were lost: mjlab loses none.")

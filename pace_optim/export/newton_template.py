@@ -26,8 +26,10 @@ def add_actuators(builder, dt=PHYSICS_DT):
     from newton.actuators import ClampingDCMotor, ClampingMaxEffort, DrivePD
 
     ends = [*builder.joint_qd_start[1:], len(builder.joint_armature)]
-    for label, q, v, end in zip(builder.joint_label, builder.joint_q_start, builder.joint_qd_start, ends, strict=True):
-        name = next((name for name in DRIVES if label == name or label.endswith("/" + name)), None)
+    found = [next((n for n in DRIVES if label == n or label.endswith("/" + n)), None) for label in builder.joint_label]
+    refuse_missing(found, "label")
+    places = zip(found, builder.joint_label, builder.joint_q_start, builder.joint_qd_start, ends, strict=True)
+    for name, label, q, v, end in places:
         if name is None:
             continue
         if end - v != 1:
@@ -67,6 +69,7 @@ def author_usd(stage, root="/", dt=PHYSICS_DT):
     joints = ("PhysicsRevoluteJoint", "PhysicsPrismaticJoint")
     prims = list(Usd.PrimRange(stage.GetPrimAtPath(root)))
     found = {p.GetName(): p for p in prims if p.GetTypeName() in joints and p.GetName() in DRIVES}
+    refuse_missing(found, "name")
     paths = {prim.GetPath() for prim in found.values()}
     for prim in prims:
         if prim.GetTypeName() == "NewtonActuator" and paths & set(prim.GetRelationship("newton:targets").GetTargets()):
@@ -92,6 +95,13 @@ def author_usd(stage, root="/", dt=PHYSICS_DT):
         actuator = stage.DefinePrim(parent.AppendChild(name + "_drive"), "NewtonActuator")
         actuator.CreateRelationship("newton:targets").SetTargets([joint.GetPath()])
         apply(actuator, schemas, values)
+
+
+def refuse_missing(found, what):
+    """A joint that is not found would move without its drive."""
+    missing = [name for name in DRIVES if name not in found]
+    if missing:
+        raise ValueError(f"No joint of the model has the {what} {', '.join(missing)}. Rename it, or change DRIVES.")
 
 
 def delay_steps(name, dt):

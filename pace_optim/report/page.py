@@ -35,6 +35,7 @@ def write_replay(folder: str | Path, output: Path | None = None) -> Path:
             f"{folder / 'best_trajectory.pt'} does not exist: the fit that made {folder} has not ended. Resume it."
         )
     path = output or folder / "replay.html"
+    path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, lambda file: file.write(render(run, [section], figures=False).encode()))
     return path
 

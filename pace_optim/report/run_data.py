@@ -17,34 +17,9 @@ from pace_envs.mujoco_warnings import collected
 from pace_envs.task_source import file_digest
 from pace_optim.run.history import History
 from pace_optim.run.result import FitResult
-from pace_optim.run.tensors import read_bounds, read_trajectory
+from pace_optim.run.tensors import RecordingData, read_bounds, read_trajectory
 
 _CURE = "Remove it or make it anew: fit, compare or diagnose again."
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RecordingData:
-    """One recording as the result simulates it: K samples of n joints."""
-
-    name: str
-    time: np.ndarray
-    """(K,) [s]."""
-    target: np.ndarray
-    """(K, n) [rad]."""
-    measured: np.ndarray
-    """Encoder positions, (K, n) [rad]."""
-    error: np.ndarray
-    """Simulated less measured, (K, n) [rad]."""
-    train: np.ndarray
-    """Whether a sample was trained on, (K,) bool."""
-    held_out: np.ndarray
-    """Whether it was kept for validation, (K,) bool."""
-    base: np.ndarray | None = None
-    """Position [m] and quaternion of a base that moves, (K, 7)."""
-    standing: np.ndarray | None = None
-    """Which of its feet touch the ground, (K, feet) bool."""
-    feet: tuple[Mapping[str, Any], ...] = ()
-    """``body`` and ``pos`` [m] of each foot."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -74,9 +49,9 @@ class RunData:
             new: Content of JSON files that are about to be written, by name, instead of the present one.
         """
         result = FitResult.load(folder)
-        trajectory = read_trajectory(folder) if os.path.lexists(folder / "best_trajectory.pt") else {}
-        names = tuple(trajectory.get("joint_names", result.joint_names))
-        if names != tuple(result.joint_names):
+        trajectory = read_trajectory(folder) if os.path.lexists(folder / "best_trajectory.pt") else None
+        names = tuple(result.joint_names)
+        if trajectory is not None and trajectory.joint_names != names:
             refuse(folder / "best_trajectory.pt", "joint_names are not those of result.json", _CURE)
         settings = _read_json(folder / "settings.json") or {}
         if not isinstance(settings, dict) or not isinstance(settings.get("settings", {}), dict):
@@ -86,7 +61,7 @@ class RunData:
             result=result,
             history=History.load(folder / "history.json") if os.path.lexists(folder / "history.json") else None,
             joint_names=names,
-            recordings=tuple(_recording(content) for content in trajectory.get("recordings", [])),
+            recordings=() if trajectory is None else trajectory.recordings,
             bounds=read_bounds(folder),
             settings=settings.get("settings", {}),
             model_digest=settings.get("model"),
@@ -142,22 +117,6 @@ def _model_file(settings: Mapping[str, Any]) -> Path | None:
     files = environment.get("files") if isinstance(environment, dict) else None
     name, digest = next(iter(files.items()), ("", "")) if isinstance(files, dict) else ("", "")
     return Path(name) if name and Path(name).is_file() and file_digest(name) == digest else None
-
-
-def _recording(content: dict[str, Any]) -> RecordingData:
-    measured, train = np.asarray(content["dof_pos"]), np.asarray(content["train"]).astype(bool)
-    return RecordingData(
-        name=content["name"],
-        time=np.asarray(content["time"]),
-        target=np.asarray(content["des_dof_pos"]),
-        measured=measured,
-        error=np.asarray(content["sim_dof_pos"]) - measured,
-        train=train,
-        held_out=~train & ~np.asarray(content.get("settling", np.zeros_like(train))).astype(bool),
-        base=None if "base" not in content else np.asarray(content["base"]),
-        standing=None if "base" not in content else np.asarray(content["standing"]).astype(bool),
-        feet=tuple(content.get("feet", ())),
-    )
 
 
 def _read_json(path: Path) -> Any | None:

@@ -23,7 +23,7 @@ from pace_optim.problem.recordings import tell_nobody, tell_on_stderr
 from pace_optim.run.resolved import first_difference, resolved
 from pace_optim.run.result import FitResult
 from pace_optim.run.settings import FitSettings
-from pace_optim.run.tensors import read_bounds
+from pace_optim.run.tensors import Trajectories, read_bounds
 
 _MOST_NAMED = 8
 _OF_A_RUN = ("settings.json", "result.json", "best_trajectory.pt")
@@ -265,15 +265,12 @@ def run_folder(run: str | Path) -> Path:
     return path
 
 
-def replay(run: Path, physical: torch.Tensor, task: str | None = None) -> dict[str, Any]:
+def replay(run: Path, physical: torch.Tensor, task: str | None = None) -> Trajectories:
     """Simulate one parameter vector on the recordings of a run.
 
     Args:
         physical: The parameters in the layout of the run's ``config.pt``, (size,).
         task: Another environment than the run's own.
-
-    Returns:
-        Trajectories as in ``best_trajectory.pt``.
     """
     problem = open_problem(run, task=task)
     if tuple(physical.shape) != (problem.space.size,):
@@ -282,7 +279,7 @@ def replay(run: Path, physical: torch.Tensor, task: str | None = None) -> dict[s
             f"{problem.task}. They belong to another task, or it has changed since."
         )
     every = problem.evaluator().residuals(physical[None].double(), problem.dataset.sampled)
-    return trajectories(problem, every)
+    return Trajectories.of(trajectories(problem, every))
 
 
 _NOT_TO_COMPARE = ("versions",)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +31,70 @@ def existing(path: Path) -> Path:
     return path
 
 
-def read_trajectory(folder: Path) -> dict[str, Any]:
-    """What ``best_trajectory.pt`` holds: ``joint_names``, and ``recordings`` with their series of K samples.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RecordingData:
+    """One recording as the result simulates it: K samples of n joints."""
 
-    Where the simulation has diverged, ``sim_dof_pos`` is NaN.
-    """
+    name: str
+    time: np.ndarray
+    """(K,) [s]."""
+    target: np.ndarray
+    """(K, n) [rad]."""
+    measured: np.ndarray
+    """Encoder positions, (K, n) [rad]."""
+    simulated: np.ndarray
+    """The same of the simulation, (K, n) [rad]; NaN where it has diverged."""
+    train: np.ndarray
+    """Whether a sample was trained on, (K,) bool."""
+    held_out: np.ndarray
+    """Whether it was kept for validation, (K,) bool. A beginning that settles is neither."""
+    enabled: np.ndarray
+    """Whether the drive gave torque, (K,) bool; runs of earlier versions do not say it."""
+    base: np.ndarray | None = None
+    """Position [m] and quaternion of a base that moves, (K, 7)."""
+    standing: np.ndarray | None = None
+    """Which of its feet touch the ground, (K, feet) bool."""
+    feet: tuple[Mapping[str, Any], ...] = ()
+    """``body`` and ``pos`` [m] of each foot."""
+
+    @functools.cached_property
+    def error(self) -> np.ndarray:
+        """Simulated less measured, (K, n) [rad]."""
+        return self.simulated - self.measured
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Trajectories:
+    """What ``best_trajectory.pt`` holds."""
+
+    joint_names: tuple[str, ...]
+    recordings: tuple[RecordingData, ...]
+
+    @classmethod
+    def of(cls, content: Mapping[str, Any]) -> Trajectories:
+        """The file's content, or what is to be written into it."""
+        return cls(joint_names=tuple(content["joint_names"]), recordings=tuple(map(_recording, content["recordings"])))
+
+
+def _recording(content: Mapping[str, Any]) -> RecordingData:
+    train = np.asarray(content["train"])
+    return RecordingData(
+        name=content["name"],
+        time=np.asarray(content["time"]),
+        target=np.asarray(content["des_dof_pos"]),
+        measured=np.asarray(content["dof_pos"]),
+        simulated=np.asarray(content["sim_dof_pos"]),
+        train=train,
+        held_out=~train & ~np.asarray(content.get("settling", np.zeros_like(train))),
+        enabled=np.asarray(content.get("torque_enable", np.ones_like(train))),
+        base=np.asarray(content["base"]) if "base" in content else None,
+        standing=np.asarray(content["standing"]).astype(bool) if "base" in content else None,
+        feet=tuple(content.get("feet", ())),
+    )
+
+
+def read_trajectory(folder: Path) -> Trajectories:
+    """What ``best_trajectory.pt`` of a run holds, checked."""
     path = existing(folder / "best_trajectory.pt")
     content = _dict(read_tensors(path, _ANEW), path, ("joint_names", "recordings"))
     names, recordings = content["joint_names"], content["recordings"]
@@ -42,7 +104,7 @@ def read_trajectory(folder: Path) -> dict[str, Any]:
         refuse(path, "recordings is no list of recordings", _ANEW)
     for r, entry in enumerate(recordings):
         _check_recording(entry, f"{path}: recordings[{r}]", len(names))
-    return content
+    return Trajectories.of(content)
 
 
 def _check_recording(entry: Any, where: str, joints: int) -> None:

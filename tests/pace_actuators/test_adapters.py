@@ -138,6 +138,7 @@ def test_isaac_lab_gives_the_torque_of_the_identification(references, tmp_path):
         theirs = plain[f"theirs_{name}"]
         assert np.abs(plain[f"ours_{name}"] - theirs).max() < 1e-5 * np.abs(theirs).max()
     assert "motor" in str(plain["refused"]) and (plain["load"] == -2.0).all()
+    assert "DriveFrictionMixin" in str(plain["unwritten"])  # a continuous loop's kd was nowhere
 
 
 @pytest.mark.slow
@@ -222,6 +223,8 @@ def test_newtons_actuators_give_the_drives_torque(whole_steps, tmp_path):
     export(whole_steps, "newton").write(tmp_path / "drives.py")
     run(others_python(), "newton_torques.py", tmp_path / "drives.py", tmp_path / "out.npz")
     found, drives = np.load(tmp_path / "out.npz"), IdentifiedDrives.load(whole_steps)
+    for name in ("add_actuators", "author_usd"):  # joints of other names were passed over
+        assert JOINTS[0] in str(found[f"{name}_refused"])
     for name in ("torque", "usd_torque"):
         assert_plain(found[name], whole_steps)
     for name, parameter in (("armature", "armature"), ("friction", "friction"), ("damping", "viscous_friction")):

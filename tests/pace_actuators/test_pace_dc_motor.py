@@ -253,7 +253,7 @@ def test_values_come_as_numbers_patterns_or_lists(value):
         ({"stiffness": [1.0, math.nan]}, "stiffness of knee is nan"),
         ({"stiffness": math.inf}, "stiffness of hip is inf"),
         ({"encoder_bias": math.inf}, "encoder_bias of hip is inf"),
-        ({"saturation_effort": math.inf}, "or None for no torque-speed curve"),
+        ({"saturation_effort": -1.0}, "or inf for no torque-speed curve"),
         ({"velocity_limit": 0.0}, "velocity_limit of hip is 0, expected a number > 0"),
         ({"delay": 11.0}, "expected 0 to max_delay = 10"),
         ({"delay_mode": "torque"}, "Available: 'command', 'effort'"),

@@ -203,6 +203,13 @@ def test_what_cannot_be_represented_is_said(result):
         check_representable(drives, World(name="a world", friction_per_step=False))
 
 
+def test_a_continuous_loop_is_said_to_need_friction_of_each_step(result):
+    """Only an exported page said so: a drive from a result had no damping in Isaac Lab."""
+    drives = IdentifiedDrives.load(changed(result, drive={"implicit": dict.fromkeys(JOINTS, 1.0)}))
+    found = {world.name: " ".join(check_representable(drives, world)) for world in (HERE, MJLAB, ISAACLAB)}
+    assert ["runs continuously" in said for said in found.values()] == [False, True, True]
+
+
 def test_soft_friction_is_in_training_and_wherever_mujoco_is(result):
     changed(result, effects=["soft_friction"], parameters={"soft_friction.time_constant": {"all": 0.02}})
     env, drives = walking(result), IdentifiedDrives.load(result)
@@ -394,6 +401,8 @@ def test_a_finer_step_keeps_the_controllers_rate_with_effects_too(result):
 def test_the_task_to_train_in_is_that_of_the_fit_s_robot_or_what_there_is_is_told(result):
     assert _task_for(str(result)) == WALK
     content = json.loads(result.read_text())
+    result.write_text(json.dumps(content | {"task": "Pace-SO101-v0"}))
+    assert _task_for(str(result)) == "Pace-SO101-Reach-v0"
     result.write_text(json.dumps(content | {"task": "/tmp/head.xml"}))
     with pytest.raises(ValueError, match=r"fit of /tmp/head\.xml, which has no task to train in.*Pace-Go2-Velocity-v0"):
         _task_for(str(result))

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from matplotlib import pyplot
@@ -127,8 +128,8 @@ def bench(tmp_path_factory) -> Path:
     torch.save(content, data)
     settings = FitSettings(task=TASK, data=[str(data)])
     write_json(run / "settings.json", {"settings": settings.to_dict(), "digests": {}})
-    first = replay(run, true_values())["recordings"][0]
-    torch.save(content | {"dof_pos": first["sim_dof_pos"]}, data)
+    (first,) = replay(run, true_values()).recordings
+    torch.save(content | {"dof_pos": torch.as_tensor(first.simulated)}, data)
     write_tensors(run / "mean_010.pt", 1.3 * true_values())
     write_tensors(run / "mean_020.pt", true_values())
     return home
@@ -138,10 +139,9 @@ def test_the_parameters_that_made_a_recording_replay_it(bench):
     run = bench / "logs" / "pace" / "test_bench" / NEW
     for name, expected in (("mean_020.pt", True), ("mean_010.pt", False)):
         content = replay(run, torch.load(run / name))
-        (recording,) = content["recordings"]
-        assert content["joint_names"] == ["servo"] and recording["train"].sum() == 0.7 * SAMPLES
-        error = (recording["sim_dof_pos"] - recording["dof_pos"]).abs().max()
-        assert (error < 1e-9) == expected
+        (recording,) = content.recordings
+        assert content.joint_names == ("servo",) and recording.train.sum() == 0.7 * SAMPLES
+        assert (np.abs(recording.error).max() < 1e-9) == expected
 
 
 def test_a_mean_is_plotted_instead_of_the_best(bench):

@@ -111,11 +111,12 @@ def adapter(cfg, data) -> dict[str, np.ndarray]:
 
     cfg.validate()
     actuator = build(cfg.copy())
+    robot = type("Articulation", (DriveFrictionMixin, FakeArticulation), {})(actuator)
+    robot._apply_actuator_model()
     out = {"torque": efforts(actuator, data), "friction": actuator.motor.joint_friction.numpy().copy()}
     out["armature"], out["viscous"] = actuator.armature.numpy(), actuator.viscous_friction.numpy()
     assert actuator.stiffness is actuator.motor.stiffness
-    robot = type("Articulation", (DriveFrictionMixin, FakeArticulation), {})(actuator)
-    robot._apply_actuator_model()
+    robot._write_friction()
     return out | {"written_friction": robot.friction[0].numpy(), "applied": robot.applied}
 
 
@@ -150,6 +151,12 @@ def main(wheel: str, output: str, result: str, configuration: str) -> None:
     out["ours_biased"] = efforts(build(PaceDCMotorActuatorCfg(motor=ours)), data)
     theirs = DCMotorCfg(joint_names_expr=[".*"], **plain, **curve)
     out["theirs_biased"] = efforts(build(theirs), data, offset=bias)  # a target of the encoder is q* + bias
+    continuous = build(PaceDCMotorActuatorCfg(motor=PaceDCMotorCfg(joint_names_expr=".*", **plain, implicit=True)))
+    try:
+        efforts(continuous, data)
+        out["unwritten"] = ""
+    except ValueError as error:
+        out["unwritten"] = str(error)
     try:
         build(PaceDCMotorActuatorCfg(motor=ours, stiffness=1.0))
         out["refused"] = ""

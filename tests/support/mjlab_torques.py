@@ -138,7 +138,7 @@ def main(robot: str, output: str, result: str, configuration: str, native_page: 
     # against mjlab's own DC motor, with what it has too: a whole delay of the command, and its encoder bias
     plain = {"stiffness": 85.0, "damping": 0.6, "effort_limit": 89.0, "saturation_effort": 140.0, "velocity_limit": 8.5}
     bias = 0.07
-    ours = PaceDCMotorCfg(joint_names_expr=".*", **plain, max_delay=4.0, encoder_bias=bias)
+    ours = PaceDCMotorCfg(joint_names_expr=".*", **plain, max_delay=4.0, encoder_bias=bias, drive_dt=DT)
     out["ours"] = World(robot, PaceDCMotorActuatorCfg(motor=ours)).run(data)
     theirs = World(robot, DcMotorActuatorCfg(target_names_expr=(".*",), **plain, delay_min_lag=4, delay_max_lag=4))
     theirs.entity.data.encoder_bias[:] = -bias

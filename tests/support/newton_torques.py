@@ -60,7 +60,7 @@ def torques(builder) -> np.ndarray:
     return np.stack(result), {name: value.numpy()[own].copy() for name, value in fields.items()}
 
 
-def stage():
+def stage(names=JOINTS):
     """The same chain in USD, with an actuator on one joint that has to go."""
     from pxr import Gf, Usd, UsdGeom, UsdPhysics
 
@@ -78,7 +78,7 @@ def stage():
         return prim.GetPath()
 
     last = body("base")
-    for name in JOINTS:
+    for name in names:
         link = body(f"{name}_link")
         joint = UsdPhysics.RevoluteJoint.Define(made, f"/World/robot/{name}")
         joint.CreateBody0Rel().SetTargets([last])
@@ -86,7 +86,7 @@ def stage():
         joint.CreateAxisAttr("Y")
         last = link
     old = made.DefinePrim("/World/robot/old", "NewtonActuator")
-    old.CreateRelationship("newton:targets").SetTargets([f"/World/robot/{JOINTS[0]}"])
+    old.CreateRelationship("newton:targets").SetTargets([f"/World/robot/{names[0]}"])
     return made
 
 
@@ -97,9 +97,14 @@ def main(page: str, output: str) -> None:
     wp.config.enable_backward = False  # less to compile
     space: dict = {}
     exec(Path(page).read_text(), space)
+    out = {}
+    for name, other in (("add_actuators", newton.ModelBuilder()), ("author_usd", stage(JOINTS[1:]))):
+        try:
+            space[name](other)
+        except ValueError as error:
+            out[f"{name}_refused"] = str(error)
     builder = robot()
     space["add_actuators"](builder)
-    out = {}
     out["torque"], fields = torques(builder)
     out |= fields
     made = stage()

@@ -117,7 +117,7 @@ def _reachable(env: Any, cfg: ReachCommandCfg) -> np.ndarray:
     high = np.where(np.isfinite(high), high, start + np.pi)
     half = 0.5 * cfg.joint_share * (high - low)
     at = [int(model.joint(name).qposadr[0]) for name in robot.driven.joints]
-    base, found = 1, []
+    base, found = robot.base_id, []
     is_site = any(model.site(i).name == cfg.site for i in range(model.nsite))
     hand = data.site(cfg.site) if is_site else data.body(cfg.site)
     for drawn in rng.uniform(-1.0, 1.0, (_PLACES, len(at))):

@@ -10,16 +10,16 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from pace_envs.closed_loops import ClosedLoops
 from pace_envs.motor_coordinates import DrivenJoints
+from pace_optim.run.tensors import RecordingData
 
-from ..run_data import RecordingData
 from .scene import scalar_joints
 
 _RATE = 50.0
 """Pictures a second of recorded time [Hz]."""
 _MOST_PICTURES = 3000
 """Of one recording: a longer one is shown at fewer pictures a second."""
-_LOOP_ITERATIONS = 20
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -31,7 +31,7 @@ class Motion:
     time: np.ndarray
     """(K,) [s]."""
     measured: np.ndarray
-    """Measured joint positions, encoder bias taken off, (K, m) [rad or m]."""
+    """Measured positions of the joints themselves, (K, m) [rad or m]."""
     simulated: np.ndarray
     """Simulated joint positions, (K, m) [rad or m]."""
     base: np.ndarray | None = None
@@ -55,7 +55,7 @@ def motions_of(
 
     Args:
         joint_names: The n joints that were measured.
-        encoder_bias: What an encoder shows beyond the joint's position, (n,) [rad or m].
+        encoder_bias: An encoder shows its joint's position less this, (n,) [rad or m].
     """
     driven = DrivenJoints.of_model(model, joint_names)
     columns = _columns(model, driven.joints)
@@ -78,7 +78,7 @@ def _motion(
     positions = []
     for shown in (recording.measured, recording.measured + recording.error):
         whole = np.tile(home, (len(kept), 1))
-        whole[:, columns] = driven.to_joints(np.nan_to_num(shown[kept] - bias))
+        whole[:, columns] = driven.to_joints(np.nan_to_num(shown[kept] + bias))
         positions.append(_closed(model, columns, whole) if model.neq else whole)
     return Motion(
         name=recording.name,
@@ -103,40 +103,18 @@ def _home(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _closed(model: mujoco.MjModel, columns: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """The same with the joints that no encoder measures moved until the model's equality constraints hold.
-
-    Gauss-Newton on the constraints' residuals, each instant from the one before; measured joints are not moved.
-    """
-    data = mujoco.MjData(model)
-    joints = scalar_joints(model)
-    address, dofs = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
-    free = np.array([i for i in range(len(joints)) if i not in set(columns.tolist())], dtype=int)
-    if not len(free):
+    """The same with the joints that no encoder measures where loops close, each instant from the one before."""
+    joints = np.array(scalar_joints(model))
+    free = np.setdiff1d(np.arange(len(joints)), columns)
+    loops = ClosedLoops.of_model(model, np.setdiff1d(np.arange(model.nv), model.jnt_dofadr[joints[free]]).tolist())
+    if loops is None:
         return positions
-    result = positions.copy()
-    for k in range(len(result)):
-        if k:
-            result[k, free] = result[k - 1, free]
-        for _ in range(_LOOP_ITERATIONS):
-            data.qpos[address] = result[k]
-            mujoco.mj_fwdPosition(model, data)
-            rows = data.efc_type[: data.nefc] == mujoco.mjtConstraint.mjCNSTR_EQUALITY
-            residual = data.efc_pos[: data.nefc][rows]
-            if not len(residual) or np.abs(residual).max() < 1e-8:
-                break
-            jacobian = _dense_jacobian(model, data)[rows][:, dofs[free]]
-            result[k, free] -= np.linalg.lstsq(jacobian, residual, rcond=1e-9)[0]
+    result, posture, address = positions.copy(), model.qpos0.copy(), model.jnt_qposadr[joints]
+    for k, row in enumerate(result):
+        row[free] = result[max(k - 1, 0), free]
+        posture[address] = row
+        row[free] = loops.nearest(posture)[address[free]]
     return result
-
-
-def _dense_jacobian(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    if not mujoco.mj_isSparse(model):
-        return data.efc_J[: data.nefc * model.nv].reshape(data.nefc, model.nv)
-    dense = np.zeros((data.nefc, model.nv))
-    for row in range(data.nefc):
-        start, count = data.efc_J_rowadr[row], data.efc_J_rownnz[row]
-        dense[row, data.efc_J_colind[start : start + count]] = data.efc_J[start : start + count]
-    return dense
 
 
 _GHOST = (0.25, 0.5, 0.85, 0.3)

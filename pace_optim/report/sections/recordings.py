@@ -8,10 +8,10 @@ import numpy as np
 from markupsafe import Markup
 
 from pace_actuators.text import position_unit, three_figures
-from pace_optim.run.tensors import rms
+from pace_optim.run.tensors import RecordingData, rms
 
 from ..markup import Section, bold, bullets, folded, html, table
-from ..run_data import RecordingData, RunData
+from ..run_data import RunData
 
 _DRIVES = 40
 """Rows of the table of drives that are shown at once."""

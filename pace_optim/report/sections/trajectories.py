@@ -8,10 +8,10 @@ import numpy as np
 
 from pace_actuators.joint_units import JointType, units_for
 from pace_actuators.text import position_unit, three_figures
-from pace_optim.run.tensors import held_out_spans, rms
+from pace_optim.run.tensors import RecordingData, held_out_spans, rms
 
 from ..markup import Section, choice, curve, html, json_script
-from ..run_data import RecordingData, RunData
+from ..run_data import RunData
 
 _SAMPLES_ON_PAGE = 70_000
 """Of all joints and recordings together; each takes some 7 bytes of the page."""

@@ -367,7 +367,8 @@ def test_commands_come_at_the_rate_that_is_asked_for(tmp_path):
 
 
 def test_a_written_configuration_is_the_one_that_the_file_stands_for(tmp_path, monkeypatch, capsys):
-    (tmp_path / "robot.xml").write_text(ARM)
+    """With a placeholder of an effort limit too, of which a small drive's armature is a tiny part."""
+    (tmp_path / "robot.xml").write_text(ARM.replace('actuatorfrcrange="-9 9"', 'actuatorfrcrange="-9000 9000"'))
     output = tmp_path / "conf" / "my_arm.py"
     words = [str(tmp_path / "robot.xml"), "--output", str(output), "--control_dt", "0.002"]
     monkeypatch.setattr(sys, "argv", ["new_robot", *words])

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -19,6 +20,7 @@ from places import ROOT
 from rsl_rl.env import VecEnv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from pace_envs import mdp
 from pace_envs.registration import load_env_cfg
 from pace_envs.rl import (
     PaceOnPolicyRunner,
@@ -31,6 +33,7 @@ from pace_envs.rl import (
     resume,
     train,
 )
+from pace_envs.rl.export import describe_policy
 from pace_envs.rl.playing import write_video
 from pace_envs.rl.run_folder import new_run_folder
 from pace_envs.rl.training import load_cfg
@@ -163,6 +166,31 @@ def test_the_exported_policies_agree_and_say_what_they_mean(run):
     torch_action = torch.jit.load(run / "exported" / "policy.pt")(obs)
     (onnx_action,) = onnx.ReferenceEvaluator(str(run / "exported" / "policy.onnx")).run(None, {"obs": obs.numpy()})
     np.testing.assert_allclose(onnx_action, torch_action.detach().numpy(), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("terms", "targets"),
+    [
+        ({"speeds": mdp.JointVelocityActionCfg(scale=0.5)}, ["speed target = action * scale + offset [rad/s]"]),
+        (
+            {
+                "hips": mdp.JointPositionActionCfg(joint_names=".*HAA"),
+                "torques": mdp.JointEffortActionCfg(joint_names=".*_[HK]FE"),
+            },
+            ["target = action * scale + offset, in the encoder's coordinates [rad]", "torque beside the controller's"],
+        ),
+    ],
+)
+def test_an_exported_policy_says_what_actions_of_any_name_and_kind_mean(terms, targets):
+    """A term of another name than joint_pos stopped the export after the training; speeds were called targets."""
+    cfg = load_cfg(RunSettings(task=TASKS[0], num_envs=2))
+    cfg.actions = terms
+    env = make_env(cfg)
+    described = describe_policy(SimpleNamespace(env=env))
+    env.close()
+    own = [described] if len(terms) == 1 else [described["actions"][name] for name in terms]
+    assert all(each["target"].startswith(target) for each, target in zip(own, targets, strict=True))
+    assert sum(len(each["joint_names"]) for each in own) == 12 and json.dumps(described)
 
 
 def test_the_same_seed_trains_the_same_policy(run, tmp_path, no_export):

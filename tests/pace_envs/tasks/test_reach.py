@@ -3,10 +3,17 @@
 import pytest
 import torch
 
-from pace_envs import ManagerBasedRLEnv, load_env_cfg
+from pace_envs import ManagerBasedRLEnv, load_env_cfg, robot_cfg_from_model
 from pace_envs.rl import RunSettings, load_cfg, train
 from pace_envs.rl.playing import PlaySettings, play
-from pace_envs.tasks.reach.reach_env_cfg import COMMAND, closeness, distance, site_position, to_command
+from pace_envs.tasks.reach.reach_env_cfg import (
+    COMMAND,
+    closeness,
+    distance,
+    reach_env_cfg,
+    site_position,
+    to_command,
+)
 
 TASK = "Pace-SO101-Reach-v0"
 WHERE = {"command_name": COMMAND, "site": "gripper_frame"}
@@ -43,6 +50,28 @@ def test_a_command_is_reached_by_the_joint_positions_that_it_was_drawn_from(env)
     at_rest = site_position(env, "gripper_frame")
     places = env.command_manager.get_term(COMMAND)._places
     assert float((places - at_rest[0]).norm(dim=1).min()) < 0.05
+
+
+TURNING = """<mujoco><compiler angle="radian"/><worldbody>
+  <body name="turret"><joint name="turn" axis="0 0 1" range="-2 2"/><geom size="0.02"/>
+    <body name="hand" pos="0.3 0 0.2"><joint name="wrist" axis="1 0 0" range="-1 1"/><geom size="0.02"/></body></body>
+</worldbody></mujoco>"""
+
+
+def test_places_are_in_the_frame_of_the_hand_where_a_joint_moves_the_first_body(tmp_path):
+    """They were in that body's own frame, in which the hand does not turn: all were one place."""
+    (tmp_path / "arm.xml").write_text(TURNING)
+    robot = robot_cfg_from_model(tmp_path / "arm.xml")
+    cfg = reach_env_cfg(robot, site="hand", action_scale=0.5, experiment_name="arm")
+    cfg.scene.num_envs, cfg.sim.num_threads = 2, 1
+    env = ManagerBasedRLEnv(cfg)
+    env.reset()
+    places = env.command_manager.get_term(COMMAND)._places
+    positions = torch.tensor([[-0.5, 0.0], [0.5, 0.0]], dtype=env.dtype)
+    env.scene["robot"].write_joint_state_to_sim(positions, torch.zeros_like(positions))
+    for place in site_position(env, "hand"):
+        assert float((places - place).norm(dim=1).min()) < 0.01
+    env.close()
 
 
 def test_a_site_that_is_not_there_is_refused_by_name():

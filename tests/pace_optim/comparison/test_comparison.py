@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from problems import BENCH, env_cfg, make_problem, record
 
+from pace_optim.comparison.compare import summary_of
 from pace_optim.comparison.dimensions import motion_of
 from pace_optim.comparison.drive_loads import load_torques
 from pace_optim.comparison.error_regions import worst_places
@@ -252,6 +253,13 @@ def test_what_is_left_of_a_good_model_is_at_the_noise_floor():
     compared = compare_joint("knee", 0, [track(np.zeros(8000))])
     assert compared.content["sentence"].startswith("knee is at the noise floor: 0.1 mrad against")
     assert compared.places == [] and compared.content["share_above_floor"] < 0.1
+
+
+def test_an_error_beside_a_joint_that_shows_no_noise_is_no_noise():
+    """A simulated recording at rest: the summary stated that the joint is within 10 % of the noise."""
+    compared = compare_joint("servo", 0, [track(np.full(8000, 0.01), np.zeros(8000), noise=0.0)])
+    assert compared.content["noise_floor"] == 0.0
+    assert summary_of([compared]).startswith("There is error above the noise floor")
 
 
 def test_an_error_without_a_place_is_said_to_be_spread_evenly():

@@ -128,6 +128,17 @@ def test_other_recordings_are_simulated_with_their_own_load(bench):
     assert first["rmse"]["train"] == pytest.approx(own["rmse"]["train"], rel=1e-6)
 
 
+def test_recordings_of_a_file_with_gaps_are_known_to_be_trained_on_or_not(bench, tmp_path):
+    """What was trained on was listed by file: two parts of one file took the next file's, and the last had none."""
+    run, files = bench
+    whole = load_recording(files["other"])
+    series = {name: np.concatenate([getattr(whole, name)] * 2) for name in ("dof_pos", "des_dof_pos")}
+    series["time"] = np.concatenate([whole.time, whole.time + 2.0])
+    np.savez(tmp_path / "gap.npz", **series, joint_names=["servo"], load_mass=1.3)
+    content = compare([run], data=[str(tmp_path / "gap.npz"), files["first"]])
+    assert [each["trained_share"] for each in content["recordings"]] == [0.0, 0.0, 1.0]
+
+
 @pytest.mark.slow
 def test_the_robots_own_sample_named_again_is_known_to_have_been_trained_on(tmp_path):
     with pytest.MonkeyPatch.context() as patch:

@@ -71,6 +71,20 @@ def test_limits_stay_where_one_joint_has_none(result):
     assert found[first] == math.inf and found[second] == 89.0
 
 
+def test_a_result_is_used_where_some_joints_have_no_torque_speed_line(result):
+    """A stall torque of inf, which stands for no line, was refused in training and in the exported page."""
+    whole, content = torques(PaceDCMotorCfg.from_result(result)), json.loads(result.read_text())
+    content["drive"]["saturation_effort"].pop(JOINTS[0])
+    content["drive"]["velocity_limit"].pop(JOINTS[0])
+    result.write_text(json.dumps(content))
+    exec(export(result, "cfg").text, space := {})
+    (cfg,) = space["ACTUATORS"].values()
+    found = torques(cfg)
+    assert np.abs(found - torques(PaceDCMotorCfg.from_result(result))).max() < 1e-6
+    differs = np.abs(found - whole).max(axis=(0, 1))
+    assert differs[0] > 1.0 and (differs[1:] < 1e-6).all()
+
+
 def test_an_export_of_a_fit_that_is_not_to_be_trusted_says_so(result):
     assert export(result, "json").warnings == []
     content = json.loads(result.read_text()) | {"times_noise": 171.0, "at_bound": [f"friction/{JOINTS[0]}"]}

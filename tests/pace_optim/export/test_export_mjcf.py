@@ -1,6 +1,7 @@
 """A user of plain MuJoCo gets the identified drive with the exported file."""
 
 import json
+import sys
 from pathlib import Path
 
 import mujoco
@@ -14,12 +15,12 @@ from torque_sequence import DT, GAINS, JOINTS, sequence, write_result
 from pace_actuators import ActuatorActions, IdentifiedDrives, PaceDCMotor, PaceDCMotorCfg
 from pace_envs import ManagerBasedRLEnv, set_physics_dt
 from pace_envs.from_model import cfg_from_model
-from pace_envs.identified import load_identified_cfg
+from pace_envs.identified import load_identified_cfg, use_identified
 from pace_envs.task_source import EnvironmentRecord
 from pace_optim.export import export
 from pace_optim.export.mjcf import model_of
 from pace_optim.export.mjcf_drives import write_drives
-from pace_optim.export.plain_drive import PlainDrive
+from pace_optim.export.plain_drive import PlainDrive, plain_drives
 from pace_optim.problem.parameter_space import ParameterSpace
 
 STEPS = 400
@@ -296,6 +297,60 @@ def test_what_steps_of_second_order_identified_moves_so_in_plain_steps(tmp_path,
     assert np.ptp(expected, axis=0).min() > 0.2 and np.abs(found - expected).max() < error
 
 
+@pytest.mark.parametrize("rate", [{"drive_dt": DT / 4}, {}], ids=["drive_dt", "held for a control step"])
+def test_a_fits_loop_rate_replaces_that_of_a_model_file_with_gains(tmp_path, rate):
+    """The file's loop is continuous: a stated or found rate was refused in training and exports, or left out."""
+    path = tmp_path / "arm.xml"
+    path.write_text(STIFF)
+    cfg = cfg_from_model(path)
+    names = list(cfg.sim2real.joint_order)
+    parameters = {name: dict.fromkeys(names, 0.1) for name in ("armature", "viscous_friction", "friction")}
+    parameters["encoder_bias"] = dict.fromkeys(names, 0.0)
+    drive = {name: dict.fromkeys(names, value) for name, value in rate.items()}
+    result = result_of(tmp_path, path, cfg, parameters, {**HELD, **drive})
+    exec(export(result, "cfg").text, written := {})
+    use_identified(cfg, result)
+    for (each,) in (written["ACTUATORS"].values(), cfg.scene.robot.actuators.values()):
+        assert not each.implicit and each.drive_dt == rate.get("drive_dt")
+    plain = plain_drives(IdentifiedDrives.load(result))[0]
+    assert {drive.run_dt for drive in plain.values()} == {rate.get("drive_dt", DT)}
+    assert any("Euler" in note for note in export(result, "mjcf").notes)
+
+
+WEIGHED = """
+<mujoco>
+  <compiler OPTIONS/>
+  <worldbody>
+    <body name="upper"><joint name="shoulder" axis="0 1 0"/>
+      <inertial pos="0.2 0 0" mass="4" diaginertia="0.02 0.06 0.06"/><geom size="0.05" mass="1"/>
+      <body name="hand" pos="0.4 0 0"><joint name="wrist" axis="1 0 0"/><geom size="0.04" mass="1"/></body></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    ("options", "upper"),
+    [('inertiafromgeom="true"', 1.0), ('settotalmass="10"', 8.0), ('inertiagrouprange="0 5"', 4.0)],
+)
+def test_an_identified_mass_holds_where_a_file_weighs_geoms_or_all_bodies_together(tmp_path, options, upper):
+    """Gymnasium's models: the identified mass was the geoms' again, 1.0 of 1.8 kg, without a word."""
+    path = tmp_path / "arm.xml"
+    path.write_text(WEIGHED.replace("OPTIONS", options))
+    cfg = cfg_from_model(path)
+    names = list(cfg.sim2real.joint_order)
+    parameters = {name: dict.fromkeys(names, 0.1) for name in ("armature", "viscous_friction", "friction")}
+    result = result_of(tmp_path, path, cfg, parameters | {"encoder_bias": dict.fromkeys(names, 0.0)}, HELD)
+    changed(result, links={"hand": {"mass": 1.8, "com": [0.01, 0.0, 0.02], "inertia": [0.002] * 3 + [0.0] * 3}})
+    use_identified(cfg, result)
+    env = ManagerBasedRLEnv(cfg)
+    exported = mujoco.MjModel.from_xml_string(export(result, "mjcf").text)
+    for model in (env.sim.model, exported):
+        found = {name: float(model.body(name).mass[0]) for name in ("upper", "hand")}
+        assert found == pytest.approx({"upper": upper, "hand": 1.8}) and model.body("hand").ipos[2] == 0.02
+    env.close()
+
+
 @pytest.mark.parametrize("page", ["newton", "mjlab_native"])
 def test_pages_for_other_simulators_move_so_in_plain_steps_too(tmp_path, page):
     """They had the identified armature and kd: at steps of 0.5 ms, an xArm 7 moved 2 mrad beside its fit."""
@@ -352,6 +407,27 @@ def test_a_model_whose_meshes_are_missing_is_written_without_them(tmp_path):
     assert notes == ["2 files of the model are missing (gone.stl, gone.png): left out."]
     path.write_text(STIFF)
     assert model_of(path)[1] == []
+
+
+def test_gravity_and_held_joints_of_the_fit_are_in_the_file_or_in_a_note(tmp_path, monkeypatch):
+    """A rig on a wall: its export hung down."""
+    path = tmp_path / "arm.xml"
+    path.write_text(STIFF)
+    cfg = cfg_from_model(path).holding({"wrist": 0.3})
+    parameters = {name: {"shoulder": 0.1} for name in ("armature", "viscous_friction", "friction", "encoder_bias")}
+    exported = export(result_of(tmp_path, path, cfg, parameters, {}), "mjcf")
+    assert mujoco.MjModel.from_xml_string(exported.text).opt.gravity.tolist() == [0.0, 0.0, -9.81]
+    assert "free here: wrist at 0.3" in " ".join(exported.notes) and "gravity" not in " ".join(exported.notes)
+
+    def on_a_wall(drives):
+        cfg = load_identified_cfg(drives)
+        cfg.sim.gravity = (0.0, 9.81, 0.0)
+        return cfg
+
+    monkeypatch.setattr(sys.modules["pace_optim.export.mjcf"], "load_identified_cfg", on_a_wall)
+    exported = export(tmp_path / "result.json", "mjcf")
+    assert mujoco.MjModel.from_xml_string(exported.text).opt.gravity.tolist() == [0.0, 9.81, 0.0]
+    assert "gravity is that of the fit" in " ".join(exported.notes)
 
 
 def test_joints_without_drives_rub_as_in_the_fit(tmp_path):

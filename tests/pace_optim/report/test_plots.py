@@ -9,7 +9,11 @@ from run_folders import JOINTS, make_history, make_trajectory
 from pace_actuators.text import position_text, position_unit, three_figures
 from pace_optim.report.plots import plot_scores, plot_trajectories
 from pace_optim.run.history import History
-from pace_optim.run.tensors import held_out_spans
+from pace_optim.run.tensors import Trajectories, held_out_spans
+
+
+def drawn(content, **options) -> dict[str, Figure]:
+    return plot_trajectories(Trajectories.of(content), **options)
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +23,7 @@ def trajectory():
 
 @pytest.fixture(scope="module")
 def figures(trajectory) -> dict[str, Figure]:
-    return plot_trajectories(trajectory, title="leg")
+    return drawn(trajectory, title="leg")
 
 
 def test_every_recording_has_a_figure_with_every_joint(figures):
@@ -55,9 +59,18 @@ def test_what_was_held_out_is_shaded_and_said(figures):
 def test_data_that_was_all_trained_on_is_not_shaded():
     trajectory = make_trajectory()
     trajectory["recordings"][0]["train"][:] = True
-    figure = plot_trajectories(trajectory)["trajectory_chirp"]
+    figure = drawn(trajectory)["trajectory_chirp"]
     assert not figure.axes[0].patches
     assert "kept for validation" not in [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_a_beginning_that_settles_is_not_called_validation():
+    """Its second was shaded and counted as held out, unlike in the report."""
+    trajectory = make_trajectory()
+    settling = trajectory["recordings"][0]["time"] < 0.5
+    trajectory["recordings"][0] |= {"train": ~settling, "settling": settling}
+    figure = drawn(trajectory)["trajectory_chirp"]
+    assert not figure.axes[0].patches and "validation" not in figure.axes[0].get_title(loc="right")
 
 
 def test_many_joints_go_on_several_figures_and_odd_names_into_file_names():
@@ -68,7 +81,7 @@ def test_many_joints_go_on_several_figures_and_odd_names_into_file_names():
         "joint_names": names,
         "recordings": [recording | wide | {"name": "a/b: ü"}, recording | wide | {"name": "a b: ü"}],
     }
-    figures = plot_trajectories(content)
+    figures = drawn(content)
     assert len(figures) == 6
     assert all("/" not in name and " " not in name for name in figures)
     shown = [axes.get_title(loc="left") for figure in list(figures.values())[:3] for axes in figure.axes]
@@ -78,7 +91,7 @@ def test_many_joints_go_on_several_figures_and_odd_names_into_file_names():
 def test_a_simulation_that_diverged_is_drawn_as_far_as_it_goes(tmp_path):
     trajectory = make_trajectory(100)
     trajectory["recordings"][0]["sim_dof_pos"][40:] = torch.nan
-    plot_trajectories(trajectory)["trajectory_chirp"].savefig(tmp_path / "a.png")
+    drawn(trajectory)["trajectory_chirp"].savefig(tmp_path / "a.png")
 
 
 def test_a_figure_can_be_saved_without_a_display(figures, tmp_path):

@@ -6,13 +6,14 @@ import pytest
 import torch
 from browser import CHROMIUM, Browser
 
+from pace_actuators import PaceDCMotor, PaceDCMotorCfg
 from pace_actuators.files import write_tensors
 from pace_envs.model_file import read_model_file
 from pace_optim.commands.replay import main
 from pace_optim.report import write_report
 from pace_optim.report.motion import looks_of, motions_of, scene_of
 from pace_optim.report.motion.motion import add_ghost
-from pace_optim.report.run_data import RecordingData
+from pace_optim.run.tensors import RecordingData
 
 from run_folders import JOINTS, make_trajectory, write_run  # isort: skip
 
@@ -59,9 +60,8 @@ def recording(n: int, samples: int = 400, seed: int = 0) -> RecordingData:
     measured = 0.4 * np.sin(tempo * time[:, None] + phase)
     error = 0.01 * np.cos(7 * time[:, None] + phase)
     train = np.ones(samples, dtype=bool)
-    return RecordingData(
-        name="chirp", time=time, target=measured, measured=measured, error=error, train=train, held_out=~train
-    )
+    series = {"target": measured, "measured": measured, "simulated": measured + error}
+    return RecordingData(name="chirp", time=time, **series, train=train, held_out=~train, enabled=train)
 
 
 @pytest.fixture(scope="module")
@@ -141,13 +141,17 @@ def test_play_goes_on_and_pause_stops(page):
     assert page.evaluate("document.querySelector('.replay').replay.state.at") == at
 
 
-def test_the_encoder_s_bias_is_taken_off():
-    model = mujoco.MjModel.from_xml_string(LEG)
+def test_joints_stand_where_an_encoder_with_bias_shows_what_was_measured():
+    """The bias was taken off once more: joints stood beside the true position by twice the bias."""
+    bias = [0.02, 0.0, -0.01]
+    drive = PaceDCMotor(PaceDCMotorCfg(joint_names_expr=".*", encoder_bias=bias), JOINTS, slice(None), 1)
     shown = recording(3)
-    (motion,) = motions_of(model, JOINTS, [shown], [0.02, 0.0, -0.01])
+    (motion,) = motions_of(mujoco.MjModel.from_xml_string(LEG), JOINTS, [shown], bias)
     assert motion.time[0] == 0.0
-    assert motion.measured[0] == pytest.approx(shown.measured[0] - [0.02, 0.0, -0.01])
-    assert motion.simulated[0] == pytest.approx(shown.measured[0] + shown.error[0] - [0.02, 0.0, -0.01])
+    for joints, encoder in ((motion.measured, shown.measured), (motion.simulated, shown.measured + shown.error)):
+        position = torch.tensor(joints[:1])
+        read = drive.observe(position, torch.zeros_like(position)) - drive.encoder_bias
+        assert read[0].numpy() == pytest.approx(encoder[0])
 
 
 def test_joints_of_a_closed_chain_that_no_encoder_measures_follow():
@@ -279,6 +283,10 @@ def test_the_command_writes_a_page_of_its_own(tmp_path, monkeypatch, capsys):
     page = (folder / "replay.html").read_text("utf-8")
     assert 'class="replay"' in page and "Plotly" not in page and len(page) < 200_000
     assert capsys.readouterr().out.splitlines()[-1] == f"run: {folder}"
+    elsewhere = tmp_path / "new" / "folder" / "x.html"
+    monkeypatch.setattr("sys.argv", ["replay", str(folder), "--viewer", "none", "--output", str(elsewhere)])
+    main()
+    assert elsewhere.read_text("utf-8") == page
 
 
 def test_without_a_model_the_command_says_so(tmp_path, monkeypatch):
