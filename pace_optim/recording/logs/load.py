@@ -59,13 +59,15 @@ class LogReader:
         facts: str | os.PathLike[str] | None = None,
         strict: bool = False,
     ):
-        """Args:
-        paths: All files and folders. One is a recording (.csv, .npz, .pt), a rosbag2 (.mcap, .db3, or its folder), a
-            ROS 1 .bag, a .parquet, the folder of a LeRobot dataset, a table with any names, or files of one log joined
-            by `+`.
-        columns: Which column is what; without it, it is guessed.
-        facts: JSON file of what is true of all recordings, where they do not state it.
-        strict: Whether an episode that cannot be used refuses its log, instead of being set aside.
+        """Look at the files and read the facts; logs are read when they are asked for.
+
+        Args:
+            paths: All files and folders. One is a recording (.csv, .npz, .pt), a rosbag2 (.mcap, .db3, or its folder),
+                a ROS 1 .bag, a .parquet, the folder of a LeRobot dataset, a table with any names, or files of one log
+                joined by `+`.
+            columns: Which column is what; without it, it is guessed.
+            facts: JSON file of what is true of all recordings, where they do not state it.
+            strict: Whether an episode that cannot be used refuses its log, instead of being set aside.
         """
         self._columns = columns
         self._strict = strict
@@ -521,7 +523,7 @@ def _union(clocks: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def rates_of(logs: Sequence[Log], columns: ColumnMap) -> list[str]:
-    """What was understood of logs with the same columns, a line for each series: where from, unit, rate, longest gap."""
+    """What was understood of logs with the same columns: where each series is from, its unit, rate and longest gap."""
     lines = []
     for series in (*MEASURED_SERIES, *CONDITIONS, *COMMAND_SERIES):
         by = {

@@ -82,8 +82,10 @@ def guessed_units(
 def _of_positions(
     known: Mapping[str, Known], channels: Mapping[str, Channel], joint_type: JointType
 ) -> tuple[dict[str, str], list[str]]:
-    """Speeds and torques in known units decide. Else positions are in the smaller unit if the other one is impossible
-    on half of the joints that say anything, and the smaller one on no joint.
+    """Speeds and torques in known units decide.
+
+    Else positions are in the smaller unit if the other one is impossible on half of the joints that say anything, and
+    the smaller one on no joint.
     """
     whole, small = _POSITIONS[joint_type]
     shown = [
@@ -94,9 +96,8 @@ def _of_positions(
     unit = whole
     if shown.count(small) != shown.count(whole):
         unit, why = (small if shown.count(small) > shown.count(whole) else whole), "by their speeds or torques"
-    elif far and 2 * len(far) >= len(saying):
-        if not any(_is_impossible(joint, small, joint_type) for joint in known.values()):
-            unit, why = small, f"{listed(far)} would be far outside of the possible range in {whole}"
+    elif 0 < len(saying) <= 2 * len(far) and not any(_is_impossible(k, small, joint_type) for k in known.values()):
+        unit, why = small, f"{listed(far)} would be far outside of the possible range in {whole}"
     if unit == whole:
         return dict.fromkeys(channels, whole), []
     most = max(channels, key=lambda name: np.abs(channels[name].values).max())

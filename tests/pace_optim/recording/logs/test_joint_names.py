@@ -13,7 +13,8 @@ from pace_optim.recording.logs import Robot, read_map, write_map
 TIME = np.arange(400) / 200
 WORDS = (
     "index_q1", "thumb_q1", "ring_q1", "left_index", "index", "motor_3", "state_joint", "wheel_current", "target_pan",
-    "id_joint", "count_wheel", "time_joint", "load_arm", "foot_left", "frame_tilt", "last_link", "task_axis", "q1", "j1",
+    "id_joint", "count_wheel", "time_joint", "load_arm", "foot_left", "frame_tilt", "last_link", "task_axis", "q1",
+    "j1",
     "A1", "rev_joint", "joint_a", "leftHip", "l_hip", "shoulder.pan", "angle_joint", "pos_joint", "head_pos",
     "speed_wheel", "limit_switch_arm", "min_arm", "pose_3", "tcp", "enable_arm", "kp_joint", "volt_wheel",
 )  # fmt: skip
