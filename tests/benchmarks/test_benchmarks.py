@@ -89,6 +89,7 @@ def test_a_table_lines_its_columns_up():
     assert lines[2].startswith("long name") and lines[3].endswith("22")
 
 
+@pytest.mark.slow
 def test_effort_delay_gets_a_recording_of_its_own_with_the_same_truth(tmp_path):
     path = identification.reference_recording("effort", tmp_path)
     problem = load_problem(identification.TASK, data=[path], delay_mode="effort")

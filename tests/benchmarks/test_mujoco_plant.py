@@ -51,10 +51,12 @@ def written(folder, monkeypatch, sizes, friction_time_constant=4e-4):
     return folder
 
 
+@pytest.mark.slow
 def test_the_base_model_moves_as_the_bodies_do(tmp_path, monkeypatch):
     assert error(written(tmp_path, monkeypatch, {})) < 2e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", HIDDEN)
 def test_a_drive_with_an_effect_moves_as_the_bodies_do(effect, tmp_path, monkeypatch):
     sizes, values = HIDDEN[effect]
@@ -72,6 +74,7 @@ def test_friction_of_mujocos_default_creeps(tmp_path):
     assert np.ptp(soft[200:]) > 1e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("friction_time_constant", [0.02, 0.05])
 def test_soft_friction_moves_as_mujocos_own(friction_time_constant, tmp_path, monkeypatch):
     folder = written(tmp_path, monkeypatch, {}, friction_time_constant)
@@ -81,6 +84,7 @@ def test_soft_friction_moves_as_mujocos_own(friction_time_constant, tmp_path, mo
     assert with_it < 0.15 * without
 
 
+@pytest.mark.slow
 def test_soft_friction_of_a_motor_behind_an_elastic_shaft_moves_as_mujocos_own(tmp_path, monkeypatch):
     sizes, values = HIDDEN["joint_elasticity"]
     folder, fine = written(tmp_path, monkeypatch, sizes, 0.02), 0.0003125

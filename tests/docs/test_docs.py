@@ -130,6 +130,7 @@ def test_the_code_runs(warm, page, tmp_path):
         assert run.returncode == 0, f"block {i}:\n{run.stderr}"
 
 
+@pytest.mark.slow
 def test_the_code_for_isaac_lab_runs_there(tmp_path):
     stubs = "from pathlib import Path\nfrom isaaclab_torques import load_isaaclab, build\n"
     stubs += f"load_isaaclab(Path({str(isaaclab_wheel())!r}))\n"

@@ -67,6 +67,7 @@ def test_commands_are_found():
     assert {"compare", "diagnose", "fit", "export", "play"} <= verbs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", documented())
 def test_it_works_on_a_run_of_another_robot_from_another_folder(line, run, tmp_path):
     script, words = taken_apart(line)

@@ -126,6 +126,7 @@ def test_the_training_environment_gives_the_torque_of_the_identification(referen
         assert_same(in_training(result), expected)
 
 
+@pytest.mark.slow
 def test_isaac_lab_gives_the_torque_of_the_identification(references, tmp_path):
     """Under the actuator classes of Isaac Lab's wheel, called as its articulation calls them; PhysX is not here."""
     found = elsewhere(sys.executable, "isaaclab_torques.py", references, tmp_path, isaaclab_wheel(), fmt="isaaclab")

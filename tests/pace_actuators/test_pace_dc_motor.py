@@ -324,6 +324,7 @@ def test_a_default_of_the_wrong_shape_is_refused():
         PaceDCMotor(PaceDCMotorCfg(joint_names_expr=".*"), JOINTS, slice(None), 1, damping=torch.ones(3))
 
 
+@pytest.mark.slow
 def test_it_runs_in_a_simulator_that_knows_nothing_of_ours():
     """A pendulum in torch, semi-implicit Euler: it settles where kp (q* - q + bias) = m g l sin q."""
     mass, length, gravity, kp, bias = 2.0, 0.3, 9.81, 40.0, 0.03

@@ -50,6 +50,7 @@ def test_the_scale_of_a_joint_has_what_follows_it(model):
     assert joint.inertia == pytest.approx(LinkMotion.of(compiled, ["root"], at, still, unit).torque().item() - gravity)
 
 
+@pytest.mark.slow
 def test_compiled_drives_and_joints_alone_carry_them_too(model, tmp_path, monkeypatch):
     """What a controller compensates of gravity is the same in the environment, compiled, and of joints alone."""
     monkeypatch.setattr(host, "_PATIENCE", 0)

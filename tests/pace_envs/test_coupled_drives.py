@@ -136,6 +136,7 @@ def test_what_a_motor_carries_is_that_of_its_joints_at_the_motor(tmp_path):
     assert stiffness == pytest.approx(np.diag(slopes), rel=1e-3)  # of each joint alone
 
 
+@pytest.mark.slow
 def test_the_plant_moves_as_the_true_parameters_say(wrist):
     shown, measured = shown_by(wrist.problem, wrist.truth), wrist.problem.dataset.measured
     error = shown - torch.tensor(WRIST.truth["encoder_bias"]) - measured[:, 0]
@@ -194,6 +195,7 @@ def test_a_log_states_the_motors_that_the_model_file_lacks(wrist, tmp_path):
         load_recording(file)
 
 
+@pytest.mark.slow
 def test_a_fit_finds_the_motors(wrist):
     problem = wrist.problem
     evaluator, cfg = problem.training_evaluator(), LeastSquaresCfg(max_iteration=6)

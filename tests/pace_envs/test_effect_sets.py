@@ -11,6 +11,7 @@ SIZES = {BENCH: (48, 1.5), SO101: (24, 0.5), "Pace-Go2-v0": (12, 0.25)}
 """Rows and seconds, for a short test; ``python tests/support/effect_sets.py`` is the long one."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", SIZES)
 def test_random_sets_of_effects_stay_finite(task):
     count, seconds = SIZES[task]
@@ -18,6 +19,7 @@ def test_random_sets_of_effects_stay_finite(task):
     assert [rows[r] for r in blown_up(task, rows, seconds, seed=0, largest=1e3)] == []
 
 
+@pytest.mark.slow
 def test_what_takes_from_friction_never_drives_a_motor_behind_a_spring():
     rows = rows_of(1, seed=0)
     assert rows == [

@@ -165,6 +165,7 @@ def mechanical_energy(bench, load, base):
     return energy
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("calls", "integrator", "seconds"),
     [(1, "implicitfast", 2.5), (5, "implicitfast", 2.5), (2, "leapfrog", 2.5), (5, "leapfrog", 2.5)],
@@ -217,6 +218,7 @@ def test_an_effect_acts_only_on_its_rows_and_joints():
     bench.follow(targets)
 
 
+@pytest.mark.slow
 def test_environments_with_different_values_do_not_mix():
     for name in ("stribeck_friction", "joint_elasticity", "drive_bandwidth", "other_delay", "payload"):
         values, count = bounds_corners(name)
@@ -234,6 +236,7 @@ def side_by_side(starts, each):
     return bench
 
 
+@pytest.mark.slow
 def test_the_reset_of_an_environment_forgets_its_history_only():
     names = [name for name in EFFECTS if name != "friction_drift"]  # it knows the session's time, which goes on
     starts = {name: {f"{name}.{p.name}": p.start for p in get_effect(name).parameters} for name in names}
@@ -263,6 +266,7 @@ def test_the_reset_of_an_environment_forgets_its_history_only():
         each.env.close()
 
 
+@pytest.mark.slow
 def test_payload_and_com_offset_are_a_hand_changed_model():
     payload = Bench(["payload"], {"payload.ratio": 0.25}, load=HEAVY).follow(MOVING)
     heavier = {**HEAVY, "load_mass": 2.0 * 1.25, "arm_mass": 0.33 * 1.25}
@@ -335,6 +339,7 @@ PAIRS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("effects", "values"), PAIRS, ids=lambda x: "+".join(x))
 def test_effects_compose_in_any_order(effects, values):
     moving = MOVING[:150]
@@ -388,6 +393,7 @@ def test_the_resonance_of_two_masses_has_its_frequency(calls, integrator, tolera
     assert frequency == pytest.approx(expected, rel=tolerance)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("task", "moving"), [(BENCH, MOVING[:150]), (ANYMAL, None)], ids=["bench", "legs"])
 def test_finer_steps_with_a_stiff_effect_converge(task, moving):
     """On all joints, also on those without it."""
@@ -405,6 +411,7 @@ def test_finer_steps_with_a_stiff_effect_converge(task, moving):
     assert float(fine.max()) < min(2e-4, order * float(coarse.max()))
 
 
+@pytest.mark.slow
 def test_the_gap_is_seen_at_a_reversal():
     """Without load the motor crosses the gap before the link follows."""
     gap = 0.03
@@ -442,6 +449,7 @@ def two_bodies(mount):
     return torch.tensor(np.array(result))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("calls", "tolerance"), [(1, 0.08), (5, 0.01)])
 @pytest.mark.parametrize("mount", [(300.0, 1.0, 0.3), (4000.0, 10.0, 2.0), (2e4, 0.0, 0.05)], ids=str)
 def test_a_mount_that_gives_way_is_a_second_body(mount, calls, tolerance):

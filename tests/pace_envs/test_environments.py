@@ -70,6 +70,7 @@ def test_gymnasiums_wrappers_run_without_an_end_of_the_episode():
     env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", ["import pace_envs", "gym.make('pace_envs:Pace-AnymalD-v0')"])
 def test_importing_registers_by_name_or_by_prefix(line, tmp_path):
     code = f"import gymnasium as gym; {line}; assert gym.make('Pace-Go2-v0', num_envs=2).unwrapped.num_envs == 2"
@@ -329,6 +330,7 @@ env.close()
 CAN_RENDER = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8).close()"
 
 
+@pytest.mark.slow
 def test_a_picture_shows_the_robot_move():
     can, done = (
         subprocess.run(

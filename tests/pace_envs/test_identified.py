@@ -462,6 +462,7 @@ def test_the_command_line_replays(anymal_run):
     assert [line.split()[0] for line in done.stdout.splitlines()[2:-2]] == list(JOINTS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [1, 3])
 def test_a_replay_where_it_was_fitted_has_its_error_whatever_rate_and_step(every, tmp_path):
     """A log slower than the control step has samples at some steps only, and the fit's finer step is the replay's."""

@@ -196,6 +196,7 @@ def test_candidates_have_links_of_their_own_and_the_compiled_kernel_agrees_with_
     assert float((python[1] - python[0]).abs().max()) > 1e-3 < float((python[2] - python[0]).abs().max())
 
 
+@pytest.mark.slow
 def test_a_wrong_mass_and_centre_are_found(tmp_path):
     link = reference("fore")
     true = link.inertia({"link_mass": 0.92, "link_com_x": 0.02})
@@ -371,6 +372,7 @@ def test_a_diagnosis_names_a_tool_that_the_file_lacks(tmp_path, monkeypatch):
     assert found.wrong[0].sentence.startswith("The link fore carries 0.") and "(not shown)" in found.wrong[0].sentence
 
 
+@pytest.mark.slow
 def test_what_one_number_on_a_joint_explains_as_well_is_no_wrong_link(tmp_path):
     """Two wrong torques of a robot were two wrong links, which left a ninth of the error."""
     recording = dataclasses.replace(recorded(tmp_path, {}, noise=1e-4), drive=Drive(stiffness=np.array([30.0, 25.0])))

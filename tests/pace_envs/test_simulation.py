@@ -134,6 +134,7 @@ def test_an_impossible_load_is_refused(load):
 # ---- time step
 
 
+@pytest.mark.slow
 def test_a_finer_physics_step_keeps_the_control_rate():
     drive = {"stiffness": 85.0, "damping": 0.6, "armature": 0.1, "viscous_friction": 4.5, "delay": 2.5}
     coarse, fine = bench(**drive), bench(**drive, physics_dt=0.0005)
@@ -172,6 +173,7 @@ def swung(dt, timeconst=None, amplitude=0.6, friction=0.2):
     return np.array(seen)
 
 
+@pytest.mark.slow
 def test_friction_of_second_order_steps_gives_way_at_once():
     """What MuJoCo's default of 20 ms smooths where the joint turns is twenty times that of two steps."""
     exact, own, default = swung(0.0001), swung(0.0025), swung(0.0025, timeconst=0.02)
@@ -220,6 +222,7 @@ def chain_whirled(steps):
     return sim.qpos[0].clone()
 
 
+@pytest.mark.slow
 def test_coriolis_forces_are_of_second_order():
     """At the speed before a step, half of the step would leave half of the error."""
     exact = chain_whirled(50)
@@ -358,6 +361,7 @@ assert torch.equal(calm[others], wild[others])
 """
 
 
+@pytest.mark.slow
 def test_a_diverged_simulation_disturbs_no_other_and_is_quiet(warm, tmp_path):
     done = warm.run("-c", DIVERGE, cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")

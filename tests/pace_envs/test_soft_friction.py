@@ -57,6 +57,7 @@ def ours(soft, dt, integrator="leapfrog"):
     return torch.stack(seen, dim=1).numpy()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("soft", [(0, 1), (0,), (1,)], ids=["both", "shoulder", "elbow"])
 def test_soft_friction_moves_as_plain_mujoco_with_fine_steps(soft):
     expected, hard = plain(soft), ours((), EVERY)[1]

@@ -63,6 +63,7 @@ def foreign(paths: list[str], is_wrong: Callable[[str, str], bool]) -> list[str]
     return [f"{path} imports {root}" for path in paths for root in sorted(roots[path]) if is_wrong(path, root)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("folder", DOWNSTREAM)
 def test_no_file_imports_what_lies_downstream(folder):
     """Imports run one way: pace_actuators <- pace_envs <- pace_optim <- scripts."""

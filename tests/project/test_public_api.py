@@ -37,6 +37,7 @@ def test_the_docs_import_from_the_packages_alone(page):
     assert found <= {*api.PACKAGES, *ADAPTERS}
 
 
+@pytest.mark.slow
 def test_importing_what_is_public_loads_torch_only_when_it_is_used():
     code = "import pace_optim, sys; assert 'torch' not in sys.modules; pace_optim.fit; sys.modules['torch']"
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)

@@ -10,6 +10,7 @@ TRIALS = 60
 """They take some 25 s of a processor, a folder to damage and all imports included."""
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="trials are forked processes")
 def test_bad_input_of_every_kind_is_one_line(warm, tmp_path):
     words = ("--trials", str(TRIALS), "--seed", "11", "--quick")

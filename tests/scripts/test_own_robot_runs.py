@@ -72,6 +72,7 @@ def copy_of(project, tmp_path) -> tuple[Path, Path]:
     return target, copied
 
 
+@pytest.mark.slow
 def test_what_a_run_keeps(project):
     folder, run = project
     content = json.loads((run / "settings.json").read_text())
@@ -121,6 +122,7 @@ def test_it_is_diagnosed_from_another_folder(project, elsewhere):
     assert (project[1] / "diagnosis.json").is_file()
 
 
+@pytest.mark.slow
 def test_it_is_fitted_again_from_another_folder(project, elsewhere):
     before = Run.open(project[1])
     settings = replace(before.settings, effects=[], log_dir=str(elsewhere / "again"))
@@ -147,6 +149,7 @@ def test_a_file_names_a_task_as_well_as_a_module(project, elsewhere):
     assert open_problem(run, task=task, effects=()).task == task == f"{folder}/swing.py:Pace-Swing-v0"
 
 
+@pytest.mark.slow
 def test_a_model_file_is_a_task(project, elsewhere):
     folder = project[0]
     words = ("--task", "../" + str((folder / "swing.xml").relative_to(elsewhere.parent)), *FIT)
@@ -230,6 +233,7 @@ def test_an_effect_that_only_a_file_names_is_not_imported(name, project, tmp_pat
     assert not (tmp_path / "executed").exists()
 
 
+@pytest.mark.slow
 def test_the_installed_command_reads_no_module_of_the_present_folder(elsewhere):
     for name in ("argparse", "torch", "numpy", "mujoco"):
         (elsewhere / f"{name}.py").write_text(f"open({str(elsewhere / 'executed')!r}, 'a')\n")

@@ -59,6 +59,7 @@ def written(done: subprocess.CompletedProcess) -> list[str]:
     return [line.removeprefix("plot: ") for line in done.stdout.splitlines()]
 
 
+@pytest.mark.slow
 def test_it_plots_both_of_the_newest_run_by_default(home):
     paths = written(plot("--robot_name", "leg", "--output", "out", cwd=home))
     assert paths == ["out/trajectory_chirp.png", "out/trajectory_steps.png", "out/score.png"]
@@ -70,6 +71,7 @@ def test_without_a_display_files_go_to_the_run(warm, home):
     assert paths == [f"logs/pace/leg/{NEW}/score.png"]
 
 
+@pytest.mark.slow
 def test_one_plot_of_one_run_can_be_chosen(home):
     arguments = ("--robot_name", "leg", "--folder_name", OLD, "--plot_trajectory", "--headless")
     paths = written(plot(*arguments, "--log_dir", home / "logs" / "pace", cwd=ROOT))

@@ -78,6 +78,7 @@ def test_a_torque_constant_falls_with_the_heat_of_the_session():
     assert drive.one(5.0) == pytest.approx(500.0 * (1 - 400 / 1600), rel=0.01)
 
 
+@pytest.mark.slow
 def test_friction_and_torque_follow_a_logged_temperature_and_voltage():
     data = joint_alone().problem.dataset
     warm = [replace(each, temperature=np.linspace(20.0, 60.0, len(each.time))[:, None]) for each in data.recordings]
@@ -181,6 +182,7 @@ def rippling(periods=61.0, size=0.5):
     return [replayed(wave, truth, fine, noise=1e-4, seed=i) for i, wave in enumerate(waves)]
 
 
+@pytest.mark.slow
 def test_the_frequency_of_a_comb_is_found_among_all_its_valleys():
     """A search sat in the valley beside it, at 63.4 per turn for 60."""
     wave, other = rippling()
@@ -196,6 +198,7 @@ def test_the_frequency_of_a_comb_is_found_among_all_its_valleys():
     assert periods == pytest.approx(61.0, abs=0.8) and math.hypot(sine, cosine) == pytest.approx(0.5, rel=0.3)
 
 
+@pytest.mark.slow
 def test_a_fit_begins_in_the_valley_of_a_comb():
     problem = make_problem(rippling()).with_effects(["torque_ripple"])
     none = {"torque_ripple.sine": {"servo": 0.0}, "torque_ripple.cosine": {"servo": 0.0}}

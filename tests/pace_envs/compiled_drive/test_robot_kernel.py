@@ -75,6 +75,7 @@ def test_the_plain_drive_of_a_joint_moves_to_the_last_digits(bench):
     assert apart(bench) < 1e-14
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("physics_dt", "first"), [(DT / 4, 0), (DT / 4, 1), (DT / 4, 2), (DT / 4, 3), (DT, 0)])
 def test_effects_move_a_joint_as_in_the_environment(bench, physics_dt, first):
     """Every one of them, several at once: each set takes a compiler a second."""
@@ -152,6 +153,7 @@ def test_delays_of_every_kind(delay_mode, rate):
     assert apart(problem) < 1e-12
 
 
+@pytest.mark.slow
 def test_facts_of_recordings_switches_speeds_and_samples_beside_the_steps(bench):
     stiff = record(chirp(0.3, 2.0, 6.0), CALM, drive={"stiffness": 60.0}, load=Load(load_mass=0.5))
     problem = make_problem([*bench.dataset.recordings, stiff])

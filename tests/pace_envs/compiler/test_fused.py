@@ -183,6 +183,7 @@ def test_draws_repeat_with_the_seed_and_are_not_the_same_twice(fusion):
     assert len(seen[2].unique()) == 5 * N and 0.4 < float(seen[2].mean()) < 0.6
 
 
+@pytest.mark.slow
 def test_what_follows_the_physics_is_the_same_in_few_kernels():
     plain, fused = ManagerBasedRLEnv(without_chance()), ManagerBasedRLEnv(without_chance())
     fusion = fusion_for(NUM_ENVS, torch.device("cpu"))

@@ -144,6 +144,7 @@ def scalars(folder: Path) -> dict[str, list[float]]:
     return {tag: [e.value for e in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
 
 
+@pytest.mark.slow
 def test_training_writes_checkpoints_logs_and_the_policy(run):
     assert {p.name for p in run.glob("model_*.pt")} == {"model_0.pt", "model_1.pt"}
     logged = scalars(run)
@@ -193,6 +194,7 @@ def test_an_exported_policy_says_what_actions_of_any_name_and_kind_mean(terms, t
     assert sum(len(each["joint_names"]) for each in own) == 12 and json.dumps(described)
 
 
+@pytest.mark.slow
 def test_the_same_seed_trains_the_same_policy(run, tmp_path, no_export):
     settings = RunSettings.read(run)
     settings.log_dir = str(tmp_path)
@@ -256,6 +258,7 @@ def _without_opengl() -> str:
     return done.stderr.strip().splitlines()[-1] if done.returncode else ""
 
 
+@pytest.mark.slow
 def test_a_policy_is_played_and_filmed_without_a_screen(run, tmp_path):
     film = tmp_path / "walk.gif"
     options = ["--checkpoint", str(run), "--num_envs", "2", "--seconds", "0.2", "--video", str(film)]

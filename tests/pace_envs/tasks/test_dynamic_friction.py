@@ -94,6 +94,7 @@ def test_a_stuck_joint_breaks_away_later_than_it_comes_to_rest():
     assert speed[2] > 0.5 and speed[3] < 0.5  # already sliding: 0.6 N m is more than 0.4, 0.3 N m less
 
 
+@pytest.mark.slow
 def test_a_fit_of_a_task_with_the_flag_recovers_both_frictions(tmp_path):
     """The bench with 0.8 N m at rest and half of it while sliding, 0.1 mrad of noise."""
     register_task("Pace-SeparatedBench-v0", lambda: separated(BENCH))

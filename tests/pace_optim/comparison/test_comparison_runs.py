@@ -71,6 +71,7 @@ def two_steps(tmp_path, **changes):
 # ---------------------------------------------------------------- what is written
 
 
+@pytest.mark.slow
 def test_a_good_fit_is_at_the_noise_floor(bench):
     run, _ = bench
     content = compare([run])
@@ -148,6 +149,7 @@ def test_the_robots_own_sample_named_again_is_known_to_have_been_trained_on(tmp_
     assert again["recordings"][0]["trained_share"] == pytest.approx(0.7)
 
 
+@pytest.mark.slow
 def test_a_finer_physics_step_is_simulated_anew(bench):
     run, _ = bench
     coarse, fine = compare([run]), compare([run], physics_dt=0.00125)
@@ -312,6 +314,7 @@ def test_runs_of_other_tasks_do_not_stand_side_by_side(tmp_path):
 # ---------------------------------------------------------------- the report
 
 
+@pytest.mark.slow
 def test_twelve_joints_and_six_recordings_stay_below_twelve_megabytes(tmp_path):
     names = [f"joint_{i}" for i in range(12)]
     run = write_run(tmp_path / "run")
@@ -344,6 +347,7 @@ def browser(tmp_path_factory):
     browser.close()
 
 
+@pytest.mark.slow
 def test_the_page_opens_without_a_complaint_and_draws_every_figure(browser):
     page, _ = browser
     assert not page.problems
@@ -381,6 +385,7 @@ def test_the_sections_are_in_the_order_of_reading(browser):
     assert [name for name in ids if name in wanted] == wanted
 
 
+@pytest.mark.slow
 def test_choosing_a_joint_and_a_recording_shows_its_numbers(browser):
     page, content = browser
     for r, j in ((0, 1), (1, 2)):

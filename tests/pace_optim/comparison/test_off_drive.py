@@ -60,6 +60,7 @@ def run(tmp_path_factory):
     return fit(FitSettings(**settings, effects=["off_damping"]))
 
 
+@pytest.mark.slow
 def test_a_fit_finds_how_a_drive_brakes_while_off(run):
     result, _ = run
     assert result.parameters["off_damping.damping"]["servo"] == pytest.approx(-0.3, abs=0.03)

@@ -329,6 +329,7 @@ def test_a_task_of_ones_own_is_imported_from_the_present_folder(tmp_path, monkey
     assert replay_score(recording, "Pace-TestBench-v0") <= EXACT
 
 
+@pytest.mark.slow
 def test_warnings_go_to_stderr_and_do_not_stop(tmp_path, capsys):
     record(tmp_path, *BENCH, "--no_plot", "--duration", "5")
     out, err = capsys.readouterr()
@@ -394,6 +395,7 @@ def test_a_missing_key_and_a_file_error_read_as_sentences(capsys):
     assert capsys.readouterr().err.splitlines() == lines
 
 
+@pytest.mark.slow
 def test_loops_of_a_file_are_simulated_as_a_fit_does(tmp_path):
     (tmp_path / "stiff.xml").write_text(
         '<mujoco model="stiff"><compiler angle="radian"/><worldbody><body>'

@@ -164,6 +164,7 @@ def test_a_collection_in_the_fork_does_not_touch_simulations(monkeypatch):
     assert found == [True, False]
 
 
+@pytest.mark.slow
 def test_what_is_found_does_not_depend_on_the_number_of_processes(monkeypatch):
     bench = joint_alone()
     model, yes = JointModel.base(bench.problem), torch.tensor([True])

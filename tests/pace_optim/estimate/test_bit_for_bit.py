@@ -9,6 +9,7 @@ import pytest
 from places import ROOT, SUPPORT
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("core", "capability", "threads"),
     [("Haswell", "default", 1), ("SkylakeX", "avx2", 2), ("Zen", "avx2", 1)],

@@ -63,6 +63,7 @@ def rolled(problem, x):
 # ---------------------------------------------------------------- recovery
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay_mode", ["command", "effort"])
 def test_the_truth_is_found_on_the_bench(delay_mode):
     truth = {**TRUTH, "delay": 1.4}
@@ -117,6 +118,7 @@ def apart(swinging):
     return run(swinging, generations=60, trees=swinging.trees, kind=Watching)
 
 
+@pytest.mark.slow
 def test_one_strategy_per_tree_is_better_than_a_joint_one_of_the_same_cost(swinging, apart):
     together = run(swinging, generations=60)
     assert [len(s.entries) for s in apart.strategies] == [5, 5] and len(together.strategies) == 1
@@ -317,12 +319,14 @@ def seen_by_a_camera(problem, truth):
     return torch.as_tensor(np.stack(positions))
 
 
+@pytest.mark.slow
 def test_position_and_velocity_weighted_recover_the_truth(longer):
     optimizer = run(longer, generations=80, kind=PositionAndVelocity)
     assert range_error(longer, optimizer.best) < 0.15
     assert rolled(longer, optimizer.best) < 1e-7
 
 
+@pytest.mark.slow
 def test_velocity_alone_recovers_what_moves_but_not_where_the_arm_is(longer):
     optimizer = run(longer, generations=80, kind=VelocityOnly)
     error = (optimizer.best - normalised(longer)).abs() / 2
@@ -330,6 +334,7 @@ def test_velocity_alone_recovers_what_moves_but_not_where_the_arm_is(longer):
     assert optimizer.best_score > 0
 
 
+@pytest.mark.slow
 def test_the_end_effectors_error_recovers_the_truth_with_a_joint_strategy(swinging):
     class Camera(EndEffector):
         seen = seen_by_a_camera(swinging, PENDULUMS_TRUTH)

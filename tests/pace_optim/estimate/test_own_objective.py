@@ -106,6 +106,7 @@ def test_scores_of_a_wrong_shape_are_refused(recording):
         Objective(PerJoint, make_problem(recording))
 
 
+@pytest.mark.slow
 def test_error_bars_of_squared_positions_are_those_of_least_squares():
     problem = make_problem(record(chirp(2.0), noise=1e-4))
     evaluator = problem.training_evaluator()
@@ -118,6 +119,7 @@ def test_error_bars_of_squared_positions_are_those_of_least_squares():
     assert np.abs(found.correlation - expected.correlation).max() < 0.3
 
 
+@pytest.mark.slow
 def test_a_fit_takes_a_class_and_writes_all_that_a_fit_writes(file, tmp_path):
     settings = FitSettings(
         task=BENCH,

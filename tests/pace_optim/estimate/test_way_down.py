@@ -52,6 +52,7 @@ def test_a_start_that_is_better_than_its_end_on_pieces_is_kept(problem):
     assert torch.equal(best.x, normalised(problem)) and best.score < 1e-14
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_longer_step_lead_to_the_end_of_the_finer_one(problem):
     cfg = env_cfg()
     set_physics_dt(cfg, cfg.sim.dt / 4)
@@ -64,6 +65,7 @@ def test_derivatives_of_a_longer_step_lead_to_the_end_of_the_finer_one(problem):
     assert at_the_finer_step < 0.65 * plain.simulated_steps
 
 
+@pytest.mark.slow
 def test_the_derivatives_of_the_error_bars_lead_from_beside_the_minimum_into_it():
     """A descent by derivatives of a longer step stops beside it."""
     cfg = env_cfg()

@@ -262,6 +262,7 @@ def result_of(folder: Path, model: Path, cfg, parameters: dict, drive: dict) -> 
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stiff", "gains", "soft", "error"),
     [(True, {}, 0.0, 2e-5), (False, HELD, 0.0, 1.5e-4), (True, {}, 0.02, 4e-5), (False, HELD, 0.02, 1.5e-4)],

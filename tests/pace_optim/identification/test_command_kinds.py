@@ -37,18 +37,21 @@ def check_truth(result, bench: Bench, tolerance: float = 0.03):
         assert found[name] == pytest.approx(true, rel=tolerance), name
 
 
+@pytest.mark.slow
 def test_a_drive_follows_velocity_targets_beside_positions(tmp_path):
     bench, position = Bench(kd=2.0, delay=0.0062), chirp(1.5)
     record(tmp_path / "a.csv", bench, position, np.gradient(position, CONTROL_DT))
     check_truth(fitted(tmp_path, tmp_path / "a.csv"), bench)
 
 
+@pytest.mark.slow
 def test_a_torque_is_fed_forward(tmp_path):
     bench, position = Bench(), chirp(1.5)
     record(tmp_path / "a.csv", bench, position, effort=1.96 * np.sin(position) + 0.3 * np.sign(np.gradient(position)))
     check_truth(fitted(tmp_path, tmp_path / "a.csv"), bench)
 
 
+@pytest.mark.slow
 def test_a_wheel_is_a_velocity_drive(tmp_path):
     bench = Bench(kd=3.0, bias=0.0, load_mass=0.3, load_length=0.1)
     speed = 12 * (chirp(1.5, top=4.0) - 0.3)

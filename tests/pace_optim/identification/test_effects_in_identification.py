@@ -104,6 +104,7 @@ def test_a_replay_begins_where_the_encoder_was_on_whichever_side(effect, values,
         assert seen - link == pytest.approx(side * twist(load), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_fit_finds_which_side_of_an_elastic_shaft_the_encoder_is_on(tmp_path):
     problem = problem_with(["joint_elasticity"], record(chirp(1.2), CALM))
     truth = {"stiffness": 600.0, "damping": 1.0, "encoder_side": 1.0}

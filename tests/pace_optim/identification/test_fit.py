@@ -115,6 +115,7 @@ def range_error(result):
 # ---------------------------------------------------------------- what is found and written
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("optimizer", "score"), [("hybrid", 1e-12), ("least_squares", 1e-12), ("cmaes", 1e-8)])
 def test_each_optimizer_finds_the_truth_and_leaves_the_runs_folder(optimizer, score, recordings, tmp_path):
     result, folder = run(
@@ -180,6 +181,7 @@ def check_search_files(folder, result):
     assert history["search_best"][-1] == pytest.approx(result.score, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay_mode", ["command", "effort"])
 def test_hybrid_is_never_worse_than_either_alone(delay_mode, recordings, tmp_path, no_report):
     """On the recording of a drive that the model cannot follow exactly, and in the delay mode that is not its own."""
@@ -213,6 +215,7 @@ def test_validation_data_do_not_touch_the_result(recordings, tmp_path, no_report
     assert any("does not carry over" in warning for warning in other.warnings)
 
 
+@pytest.mark.slow
 def test_a_finer_physics_step_and_a_delay_mode_are_kept_in_the_result(recordings, tmp_path, no_report):
     result, _ = run(tmp_path, recordings["clean"], optimizer="least_squares", physics_dt=0.00125, delay_mode="effort")
     assert result.physics_dt == 0.00125 and result.delay_mode == "effort" and result.control_dt == 0.0025
@@ -284,6 +287,7 @@ def same_result(resumed, whole):
     return all(getattr(resumed, name) == getattr(whole, name) for name in same)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("optimizer", "method", "count"),
     [
@@ -314,6 +318,7 @@ def test_an_interrupted_fit_ends_cleanly_and_resumes_to_the_same_result(
         assert histories[0] == histories[1]
 
 
+@pytest.mark.slow
 def test_interrupted_twice_resumes_to_the_same_result(recordings, whole, tmp_path, no_report, monkeypatch):
     options = {"optimizer": "least_squares", "max_iteration": 20, "save_optimization_process": True}
     expected, _ = whole("noisy", **options)
@@ -357,6 +362,7 @@ def test_a_result_is_written_before_it_is_checked_and_an_interrupted_check_leave
             assess_interrupted=False)  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_finished_run_resumes_to_itself(recordings, tmp_path, no_report):
     for optimizer in ("least_squares", "hybrid", "cmaes"):
         whole, folder = run(tmp_path, recordings["noisy"], optimizer=optimizer, max_iteration=4)

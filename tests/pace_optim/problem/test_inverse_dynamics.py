@@ -55,6 +55,7 @@ def test_what_gravity_takes_is_the_slope_of_the_potential_energy(model):
     np.testing.assert_allclose(torque[1:-1], slope[1:-1], atol=1e-4 * np.abs(slope).max())
 
 
+@pytest.mark.slow
 def test_the_power_of_the_torque_is_the_change_of_the_energy(model):
     time = np.linspace(0.0, 1.0, 2001)
     position = 0.2 + 0.3 * np.sin(2 * np.pi * 3 * time)[:, None]

@@ -93,6 +93,7 @@ def test_commands_for_each_control_step_need_no_clock():
     assert command_interval(recording) == pytest.approx(0.001)
 
 
+@pytest.mark.slow
 def test_a_fit_takes_the_rate_of_the_logs_commands_and_its_run_keeps_it(tmp_path):
     robot = tmp_path / "head.xml"
     robot.write_text(HEAD.format(MOTORS))

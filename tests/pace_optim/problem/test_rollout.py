@@ -237,6 +237,7 @@ def test_a_recording_sampled_slower_than_the_control_is_compared_at_its_samples(
     assert scores(problem, TRUTH) <= EXACT
 
 
+@pytest.mark.slow
 def test_a_search_stores_nothing_of_the_size_of_population_times_time():
     problem = make_problem(record(chirp(2.0)))
     population, steps = 64, 801

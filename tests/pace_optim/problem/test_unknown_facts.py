@@ -41,6 +41,7 @@ def run(soft, tmp_path_factory):
     return fit(settings)
 
 
+@pytest.mark.slow
 def test_unknown_gains_are_identified_as_factors_of_what_is_stated(run):
     result, _ = run
     assert result.effects == ["proportional_gain", "derivative_gain"]
@@ -83,6 +84,7 @@ def test_the_gains_themselves_are_told_where_they_are_one_set(run, soft):
     assert told(problem.dataset.recordings[:1], ["proportional_gain.gain/servo"]) == [damping]
 
 
+@pytest.mark.slow
 def test_a_stiffness_that_the_recordings_do_not_determine_is_listed(tmp_path):
     weightless = Bench(load_mass=1e-6, stated={"stiffness": 40.0, "damping": 1.0})
     path = record(tmp_path / "free.csv", weightless, position=chirp(1.0))
@@ -153,6 +155,7 @@ def test_loops_that_do_not_act_ask_for_nothing():
     assert asked == pytest.approx(40 * 0.1 - 40 * speed + torque)
 
 
+@pytest.mark.slow
 def test_a_limit_that_was_found_is_that_of_the_drive(tmp_path):
     path = record(tmp_path / "weak.csv", Bench(current_limit=8.0, stated={"effort_limit": 20.0}), position=chirp(1.0))
     settings = FitSettings(

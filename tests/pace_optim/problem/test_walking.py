@@ -316,6 +316,7 @@ def test_a_registered_robot_that_walks_is_simulated_with_finer_steps(tmp_path):
     assert used == [(DT, "implicitfast"), (DT / 4, "leapfrog")]
 
 
+@pytest.mark.slow
 def test_a_leg_that_stands_throughout_is_named(tmp_path):
     always = crawler(1).simulate(1.0)["contact"]
     always[:, 3] = True

@@ -236,6 +236,7 @@ def browser(run, tmp_path_factory):
     browser.close()
 
 
+@pytest.mark.slow
 def test_it_opens_without_a_complaint_or_a_request(browser, run):
     assert not browser.problems
     own = (run / "report.html").resolve().as_uri()
@@ -302,6 +303,7 @@ def test_the_score_can_be_seen_over_steps_and_time(browser):
         assert shown_last == pytest.approx(last)
 
 
+@pytest.mark.slow
 def test_it_is_dark_where_the_reader_s_screen_is(run, tmp_path):
     if CHROMIUM is None:
         pytest.skip("there is no Chromium here: apt-get install chromium")

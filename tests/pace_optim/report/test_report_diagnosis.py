@@ -144,6 +144,7 @@ def test_its_texts_are_escaped(tmp_path):
     assert NASTY in page.text and "img" not in page.tags and not page.unbalanced
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verdict", ["effect", "unknown"])
 def test_it_is_drawn_without_a_complaint(tmp_path, verdict):
     if CHROMIUM is None:

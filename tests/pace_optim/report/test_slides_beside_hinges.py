@@ -83,6 +83,7 @@ def test_a_column_without_a_unit_is_millimetres_where_metres_leave_the_slides_ra
     assert "read as millimetres" in " ".join(said) and "degrees" not in " ".join(said)
 
 
+@pytest.mark.slow
 def test_the_fit_tells_each_in_its_unit(fitted):
     _, said = fitted
     assert "train / validation [mrad]" in said and "train / validation [mm]" in said

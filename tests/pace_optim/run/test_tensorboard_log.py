@@ -105,6 +105,7 @@ def test_nothing_is_written_before_the_first_event(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_importing_it_does_not_import_tensorboard():
     import subprocess
 

@@ -101,6 +101,7 @@ def test_a_free_swing_has_the_period_of_the_closed_form():
     assert q == pytest.approx(0.02 * np.cos(frequency * np.arange(500) * DT), abs=2e-5)
 
 
+@pytest.mark.slow
 def test_viscous_friction_lets_a_speed_die_out_exponentially():
     light = Load(load_mass=2.0, load_length=0.375, arm_mass=0.33)
     truth = Truth(base=BaseTruth(armature=0.1, viscous_friction=3.0, friction=0.0, delay=0.0))
@@ -114,6 +115,7 @@ def test_viscous_friction_lets_a_speed_die_out_exponentially():
     assert np.abs(fine - finer).max() < 2e-6, "smooth torques are integrated to second order"
 
 
+@pytest.mark.slow
 def test_a_link_swings_on_behind_a_motor_that_sticks():
     """Coulomb friction is the motor's; an elastic shaft without damping hands none of it to the link."""
     base = replace(BASE, friction=3.0)
@@ -124,6 +126,7 @@ def test_a_link_swings_on_behind_a_motor_that_sticks():
     assert positions(Truth(base=base), [run_of(step)])[0].dof_pos[-200:].std() < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [None, "stribeck_friction", "joint_elasticity", "backlash", "presliding_friction", "creeping_friction"]
 )
@@ -141,6 +144,7 @@ def test_a_stuck_joint_does_not_creep():
     assert np.all(q == 0.0)
 
 
+@pytest.mark.slow
 def test_sliding_stops_where_the_torque_fits_between_the_bounds():
     q = positions(Truth(base=replace(BASE, encoder_bias=0.0)), [run_of(np.full((1200, 1), 0.5))])[0].dof_pos[:, 0]
     assert np.ptp(q[-200:]) == 0.0
@@ -166,6 +170,7 @@ def test_coupled_joints_obey_the_friction_law_exactly():
 # --- against our model
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay_mode", ["command", "effort"])
 def test_without_effects_the_model_converges_to_the_plant(delay_mode):
     truth = Truth(base=BASE, delay_mode=delay_mode)
@@ -269,6 +274,7 @@ def test_truths_side_by_side_are_the_truths_alone():
             assert np.array_equal(alone.dof_pos, recording.dof_pos)
 
 
+@pytest.mark.slow
 def test_noise_and_lattice_are_those_asked_for():
     truth, still = Truth(base=replace(BASE, encoder_bias=0.0)), run_of(np.zeros((4000, 1)))
     assert positions(truth, [still], replace(COARSE, noise=1e-4))[0].dof_pos.std() == pytest.approx(1e-4, rel=0.05)
@@ -276,6 +282,7 @@ def test_noise_and_lattice_are_those_asked_for():
     assert np.abs(coarse - np.round(coarse)).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_legs_are_simulated_with_effects_on_chosen_joints():
     robot = plant_robot("Pace-AnymalD-v0")
     knees = joints_of(robot, ".*KFE")
@@ -380,6 +387,7 @@ def test_data_collection_hides_an_effect_and_says_so_beside_the_recording(drawn_
     assert load_recording(path).dof_vel is None
 
 
+@pytest.mark.slow
 def test_recordings_made_one_by_one_with_the_same_seed_are_of_one_robot(drawn_by_a_second, tmp_path):
     truths = []
     for motion in ("steps", "multisine"):

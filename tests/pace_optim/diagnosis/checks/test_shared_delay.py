@@ -71,6 +71,7 @@ def test_a_joint_is_late_beside_a_delay_that_most_joints_have(delay, late):
     assert later_than_most(torch.tensor(delay)).nonzero()[:, 0].tolist() == late
 
 
+@pytest.mark.slow
 def test_late_joints_get_the_delay_of_the_others_and_something_to_explain(legs):
     problem, twins, base, effort = fitted(legs, logged_late)
     held, (sentence,) = hold_late_joints(FITS, twins, base)
@@ -86,6 +87,7 @@ def test_late_joints_get_the_delay_of_the_others_and_something_to_explain(legs):
     assert torch.equal(absorbed[LATE_LOG], ~late)
 
 
+@pytest.mark.slow
 def test_where_no_joint_is_late_the_base_model_stays_as_it_is(punctual):
     twins, base = punctual
     assert hold_late_joints(FITS, twins, base) == (base, [])

@@ -69,6 +69,7 @@ def test_wide_bounds_travel_with_the_effect_s_name():
     assert EffectCfg.parse("payload@wide").label == "payload@wide" and not EffectCfg.parse("payload").wide
 
 
+@pytest.mark.slow
 def test_a_fit_that_a_bound_holds_back_goes_on_beyond_it():
     robot = joint_alone()
     here = torch.tensor([True])

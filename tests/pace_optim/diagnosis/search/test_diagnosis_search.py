@@ -41,6 +41,7 @@ def test_a_search_ends_where_no_effect_gains_anything(bench):
     assert outcome.rounds == [] and outcome.final is base
 
 
+@pytest.mark.slow
 def test_rivals_are_sent_to_the_recording_where_they_part(bench):
     base = JointModel.base(bench.problem)
     values = bench.truth_values

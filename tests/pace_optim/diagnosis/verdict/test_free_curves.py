@@ -122,6 +122,7 @@ def curves(fitted):
     return fit_curves(FITS, ended(fitted, 1.0), FLOOR, ~YES)
 
 
+@pytest.mark.slow
 def test_the_curve_over_the_right_variable_explains_the_error(fitted, curves):
     joint = error_map(curves, ["servo"], curves.errors[0])["servo"]
     assert joint["best"] == "friction_over_position" and joint["best_label"] == "position [rad]"

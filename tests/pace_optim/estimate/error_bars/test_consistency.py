@@ -36,6 +36,7 @@ def recordings():
     ]
 
 
+@pytest.mark.slow
 def test_recordings_at_three_gains_agree(recordings):
     found = checked(recordings)
     assert found.recordings == ("soft", "middle", "stiff")
@@ -44,6 +45,7 @@ def test_recordings_at_three_gains_agree(recordings):
     assert found.simulated_steps > 0
 
 
+@pytest.mark.slow
 def test_a_damping_that_is_misreported_by_30_percent_is_named_with_its_recording_and_its_size(recordings):
     wrong = dataclasses.replace(
         recordings[2], drive=Drive(stiffness=np.array([120.0]), damping=np.array([4.0 / 1.3])), name="wrong"
@@ -55,6 +57,7 @@ def test_a_damping_that_is_misreported_by_30_percent_is_named_with_its_recording
     assert gain[0].startswith("wrong behaves as if its damping were 30% higher than stated (4 instead of 3.08")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", range(3))
 def test_the_recording_to_refit_is_known_beforehand(recordings, place):
     kp, kd = list(GAINS.values())[place]
@@ -97,6 +100,7 @@ def test_a_delay_longer_than_a_controller_of_another_rate_allows_is_refused(monk
         load_problem("Pace-TestBench-v0")
 
 
+@pytest.mark.slow
 def test_recordings_are_fitted_alone_from_the_derivatives_that_are_known(recordings):
     """The same is said of each, for fewer simulations."""
     wrong = dataclasses.replace(recordings[2], drive=Drive(stiffness=np.array([120.0]), damping=np.array([3.6])))

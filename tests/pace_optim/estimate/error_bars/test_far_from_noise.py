@@ -180,6 +180,7 @@ def test_what_is_asked_of_a_drive_and_what_gravity_takes_are_told():
     )
 
 
+@pytest.mark.slow
 def test_a_delay_that_is_not_told_from_none_is_none():
     """Beside large gains it would take damping and inertia along."""
 

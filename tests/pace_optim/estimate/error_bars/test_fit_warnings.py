@@ -124,6 +124,7 @@ def test_several_loops_are_told_in_one_sentence(tmp_path):
     assert "left (" in told and " and right (" in told
 
 
+@pytest.mark.slow
 def test_the_simulation_oscillates_by_itself_where_the_warning_says_so():
     ends = {}
     for part in (0.7, 1.3):

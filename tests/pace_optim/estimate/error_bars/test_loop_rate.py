@@ -39,12 +39,14 @@ def fitted(problem):
     return best.x, assess(problem, evaluator, best.x)
 
 
+@pytest.mark.slow
 def test_a_recording_of_a_simulation_with_the_assumed_rate_and_this_very_step_says_nothing_of_others():
     problem = recorded_at(0.0025)
     x, known = fitted(problem)
     assert loop_rates(problem, x, known.jacobian, ~np.isnan(known.uncertainty.std)) is None
 
 
+@pytest.mark.slow
 def test_a_rate_that_fits_best_is_compared_with_the_others_too():
     """Its values depend on it all the same. Where the fit's own step was the best, none was compared."""
     problem = recorded_at(0.0005).with_loop(0.0005)
@@ -54,6 +56,7 @@ def test_a_rate_that_fits_best_is_compared_with_the_others_too():
     assert rates.chosen == 0.0005 and len(rates.periods) > 3
 
 
+@pytest.mark.slow
 def test_a_rate_is_fitted_to_its_end_where_the_derivatives_of_the_fit_do_not_serve():
     """A step that gained nothing passed for an end: the right rate was refused, and wrong values had small bars."""
     problem = recorded_at(0.001).with_loop(0.0005)
@@ -67,6 +70,7 @@ def test_a_rate_is_fitted_to_its_end_where_the_derivatives_of_the_fit_do_not_ser
     np.testing.assert_allclose(rates.values, right.values, rtol=2e-2, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("physics_dt", [0.0025, 0.0005])
 def test_the_error_bars_hold_a_rate_that_a_log_with_gains_does_not_state(physics_dt):
     """Viscous friction was 53 % high with an error bar of 0.5 %, as a log that states gains seemed to state all."""
@@ -93,6 +97,7 @@ def test_a_later_loop_takes_away_viscous_friction_and_armature():
     np.testing.assert_allclose(moved, wanted, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_another_rate_that_explains_no_more_is_not_descended_with(tmp_path):
     """Where physics is missing, half of a fit's time went there."""
     problem = recorded_at(0.0025)
@@ -107,6 +112,7 @@ def test_another_rate_that_explains_no_more_is_not_descended_with(tmp_path):
     assert not [each.stage for each in run.descents if each.stage.startswith("loop")]
 
 
+@pytest.mark.slow
 def test_a_fit_goes_on_with_loops_of_another_rate_that_explain_more(tmp_path):
     """A drive that saturates made 13 times the noise of it, and a diagnosis named an effect that was not there."""
     problem = recorded_at(0.001, noise=1e-5)

@@ -96,6 +96,7 @@ def log(tmp_path_factory):
     return save_recording(path, replayed(chirp(1.0, high=10.0), CALM, recorded, noise=1e-4))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stated", "finest"), [(None, 0.00125), (0.0025, 0.0025)])
 def test_a_step_that_shows_in_the_error_is_halved_unless_it_is_stated(log, tmp_path, stated, finest):
     settings = FitSettings(

@@ -62,6 +62,7 @@ def test_an_imu_that_is_late_is_shifted_for_the_fit(problem):
     assert checked(problem).imu_delays == {}
 
 
+@pytest.mark.slow
 def test_a_contact_that_sticks_is_found(view):
     stuck = view.standing.copy()
     stuck[:, 1] = True

@@ -61,6 +61,7 @@ def test_the_base_model_moves_along_what_was_measured_only_near_it(bench, monkey
     assert used == references
 
 
+@pytest.mark.slow
 def test_how_far_a_joint_is_from_its_reference(bench):
     motion = ReferenceUpdate(fits=FITS, problem=bench.problem, candidates=(), enough=torch.zeros(1))
 
@@ -72,6 +73,7 @@ def test_how_far_a_joint_is_from_its_reference(bench):
     assert away(encoder_bias=CALM["encoder_bias"] + 0.03) == pytest.approx(0.03, rel=0.1)
 
 
+@pytest.mark.slow
 def test_an_effect_in_one_slot_changes_no_other(bench):
     base = JointModel.base(bench.problem)
     with_effects = [base.with_effect(e, torch.tensor([True])) for e in (STRIBECK, QUADRATIC)]
@@ -100,6 +102,7 @@ def test_an_effect_in_one_slot_changes_no_other(bench):
     assert float(off[0].square().mean().sqrt()) < 5e-5  # the twins move as the robot
 
 
+@pytest.mark.slow
 def test_models_that_share_no_effects_move_side_by_side_as_each_alone(bench):
     base, here = JointModel.base(bench.problem), torch.tensor([True])
     start = torch.tensor([[CALM[name] for name in BASE]], dtype=torch.float64)
@@ -237,6 +240,7 @@ def test_joints_along_the_motion_of_a_robot_with_an_effect_move_as_it_does(bench
     assert float((path.position - bench.twins.path.position).abs().max()) > 3e-3  # the effect is seen
 
 
+@pytest.mark.slow
 def test_a_model_is_fitted_along_the_motion_that_it_gives_the_robot(bench):
     heavy = bench.truth.clone()
     heavy[bench.problem.space["armature"]] *= 3

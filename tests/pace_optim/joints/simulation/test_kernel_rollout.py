@@ -84,6 +84,7 @@ def legs():
     return SimpleNamespace(problem=problem, twins=twin_problem(problem, path).with_physics_dt(0.00125), start=start)
 
 
+@pytest.mark.slow
 def test_every_effect_moves_a_joint_as_in_the_simulation(kernels, bench):
     names = EFFECTS
     models = slots_of(bench.problem, bench.start, *([get_effect(name)] for name in names))

@@ -47,6 +47,7 @@ def test_a_joint_without_speed_push_and_friction_stays():
     assert turned(zero - 1.0, zero + 1.0, zero).tolist() == [0.0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("payload", [0.0, 0.3])
 def test_friction_under_load_is_what_it_is_on_the_robot(payload):
     """Its drives are told of weight, and not of what their neighbours' accelerations do."""
@@ -62,6 +63,7 @@ def test_friction_under_load_is_what_it_is_on_the_robot(payload):
     assert float((moved_by(twins, sought)[:, 0] - torch.as_tensor(recording.dof_pos)).abs().max()) < 3e-4
 
 
+@pytest.mark.slow
 def test_soft_friction_is_what_it_is_on_the_robot():
     """MuJoCo scales it by what the whole robot lets a torque do, not by the joint's inertia alone."""
     fine = env_cfg(ANYMAL)
@@ -90,6 +92,7 @@ def test_a_joint_s_own_payload_is_that_of_its_link_alone():
     assert bool((twice[..., 0] < 0.5 * whole[..., 0]).all())  # the hip moves thigh and shank too
 
 
+@pytest.mark.slow
 def test_a_joint_without_neighbours_moves_alike_along_what_was_measured():
     """With noise on it, every third sample only, an encoder bias, and a payload sought beside the known load."""
     fine = env_cfg()
@@ -116,6 +119,7 @@ def test_a_joint_without_neighbours_moves_alike_along_what_was_measured():
     assert float((without - robot).abs().max()) > 2e-3  # the payload shows
 
 
+@pytest.mark.slow
 def test_a_weight_that_is_not_there_pulls_nowhere():
     """Also where the joint is far from the reference along which gravity is linear."""
     recording = record(chirp(1.0), CALM, cfg=env_cfg())
@@ -130,6 +134,7 @@ def test_a_weight_that_is_not_there_pulls_nowhere():
     assert float((moved_by(twins, truth) - robot).abs().max()) < 1e-3  # 8e-3 where its pull back stayed
 
 
+@pytest.mark.slow
 def test_a_joint_is_moved_by_what_its_neighbours_did_whatever_they_are_said_to_be():
     """A knee that is said to have a thirtieth of its friction moves wrongly, and its thigh would with it."""
     cfg, fine = env_cfg(ANYMAL), env_cfg(ANYMAL)
@@ -152,6 +157,7 @@ RUBBING = FOUR_BAR.replace('"rocker"', '"rocker" frictionloss="0.02"')
 LEANING = FINGER.replace('stiffness="0.02"', 'stiffness="0.2"')
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "model", [FOUR_BAR, SPRUNG, RUBBING, LEANING], ids=["four_bar", "sprung", "rubbing", "leaning"]
 )

@@ -75,6 +75,7 @@ def fitted(recording, start=None):
     return problem.space.to_physical(x).numpy(), uncertainty, width
 
 
+@pytest.mark.slow
 def test_fits_scatter_as_the_expected_error_bars_say():
     chosen = design(duration=1.0)
     clean = record(chosen.trajectory.des_dof_pos, NEAR)
@@ -87,6 +88,7 @@ def test_fits_scatter_as_the_expected_error_bars_say():
     assert 1 / 1.5 < np.exp(np.log(ratio).mean()) < 1.5, ratio
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("excitation", ["chirp", "multisine", "steps", "ramp"])
 def test_the_chosen_motion_is_never_worse_and_stays_in_the_robots_range(excitation):
     chosen = design(excitation=excitation, settings=replace(SMALL, candidates=(4, 2)), duration=4.0)
@@ -95,6 +97,7 @@ def test_the_chosen_motion_is_never_worse_and_stays_in_the_robots_range(excitati
     assert check_command(chosen.trajectory, LIMITS) == []
 
 
+@pytest.mark.slow
 def test_each_limit_binds():
     """With narrow joint limits, slow drives or weak ones, the chosen motion keeps to them."""
     narrow = replace(LIMITS, position=np.array([[-0.2, 0.6]]), velocity=np.array([2.0]))
@@ -106,6 +109,7 @@ def test_each_limit_binds():
     assert weak.joints == (None,)  # every candidate needs more torque than there is
 
 
+@pytest.mark.slow
 def test_each_tree_takes_its_own_best(tmp_path):
     cfg = pendulums_cfg(tmp_path)
     cfg.sim2real.excitation = ExcitationCfg(bias=(0.0, 0.0), direction=(1.0, 1.0), scale=(0.3, 0.3))
@@ -137,6 +141,7 @@ def test_a_joint_without_amplitude_rests_while_the_other_is_optimised(tmp_path):
     assert np.ptp(chosen.trajectory.des_dof_pos[:, 1]) == 0.0 < np.ptp(chosen.trajectory.des_dof_pos[:, 0])
 
 
+@pytest.mark.slow
 def test_a_tiny_motion_around_one_pose_confounds_bias_and_friction_and_the_optimised_one_parts_them():
     """2 mrad at 0.8 rad: the arm sags once and then stays within friction, so gravity (which knows the bias) and
     friction are seen only as a sum."""
@@ -173,6 +178,7 @@ def test_what_is_not_known_is_expected_in_the_middle_of_the_bounds():
     assert values["viscous_friction"]["servo"] == 3.5
 
 
+@pytest.mark.slow
 def test_a_collection_writes_the_optimised_motion_and_its_recording(tmp_path):
     cfg = CollectionCfg(
         task=BENCH,

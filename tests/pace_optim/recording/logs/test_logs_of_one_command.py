@@ -149,6 +149,7 @@ def test_all_files_that_cannot_be_used_are_named(tmp_path):
         _each(paths, read, False, print)
 
 
+@pytest.mark.slow
 def test_import_takes_the_gains(tmp_path):
     path, facts = log_of(tmp_path / "one.csv"), facts_of(tmp_path)
     code = "from pace_optim.commands.import_log import main; main()"

@@ -276,6 +276,7 @@ def test_a_log_at_another_rate_than_the_drive_is_read_at_its_own_samples():
     assert 2 - law.resolution <= law.delay <= 2 + law.resolution
 
 
+@pytest.mark.slow
 def test_a_gain_that_torques_contradict_is_used_where_it_fits_better(tmp_path, monkeypatch):
     monkeypatch.setattr(fit_module, "write_report", lambda folder: None)
     kp, kd, delay, stated = 85.0, 0.6, 2, 60.0

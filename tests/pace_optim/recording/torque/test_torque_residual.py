@@ -65,6 +65,7 @@ def run(log, told, tmp_path_factory):
     return fit_with_torques(settings(log, tmp_path_factory.mktemp("runs"), unknown=GAINS), ProgressLine(told))
 
 
+@pytest.mark.slow
 def test_torques_on_which_gains_depend_are_followed_where_positions_end_above_the_noise(run, told):
     result, folder = run
     first = Path(FitSettings.load(folder / "settings.json")[0].instead_of)
@@ -73,6 +74,7 @@ def test_torques_on_which_gains_depend_are_followed_where_positions_end_above_th
     assert "their noise is left of the torques: this fit is kept" in told.getvalue()
 
 
+@pytest.mark.slow
 def test_an_interrupted_fit_with_torques_resumes_to_the_same_result(tmp_path, monkeypatch):
     """Where torques have got their noise; steps that are simulated again count once."""
     bench = Bench(stated={"stiffness": 20.0, "damping": 0.5})
@@ -135,6 +137,7 @@ def test_the_second_fit_with_torques_follows_a_resumed_first_one(short, tmp_path
     assert [(asked.residual, asked.instead_of) for asked in begun] == [([], str(folder))]
 
 
+@pytest.mark.slow
 def test_filtered_torques_are_not_followed_by_themselves(tmp_path):
     """A low pass of 11 ms: with free gains the positions are followed better, by a drive that is not the robot's."""
     told, bench = StringIO(), Bench(stated={"stiffness": 20.0, "damping": 0.5})
@@ -168,6 +171,7 @@ def test_a_run_is_opened_with_the_noise_that_its_torques_had(run):
     assert not alone.torque_noise and not any(label.startswith("torque") for label in alone.space.labels)
 
 
+@pytest.mark.slow
 def test_compiled_and_stepped_torques_are_those_of_the_law(run, monkeypatch):
     problem = open_problem(run[1]).with_effects(()).with_physics_dt(CONTROL_DT)
     physical = problem.space.to_physical(problem.space.start)
@@ -189,6 +193,7 @@ def test_compiled_and_stepped_torques_are_those_of_the_law(run, monkeypatch):
     assert torch.allclose(compiled[2:-2], (held - kd * speed)[2:-2], atol=0.1) and float(held.std()) > 1
 
 
+@pytest.mark.slow
 def test_a_filtered_torque_does_not_spoil_a_fit(tmp_path):
     log = record(tmp_path / "log.csv", Bench(), position=chirp(4.0), sensor=filtered)
     result, _ = fit(settings(log, tmp_path, residual=BOTH))

@@ -89,6 +89,7 @@ def page(tmp_path_factory):
         browser.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["measured", "simulated"])
 def test_bodies_stand_in_the_browser_where_mujoco_puts_them(page, which):
     model = mujoco.MjModel.from_xml_string(LEG)
