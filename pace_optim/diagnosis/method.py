@@ -119,7 +119,7 @@ def search_effects(
     # which of them have earned their names; where none has, a curve
     say("leaving out each effect in turn")
     names = earned_names(fits, outcome, data.floor, log)
-    without = pool(fits, names.outcome, log)
+    without = pool(fits, names.outcome, data.floor, log)
     curves = fit_curves(fits, without, data.floor, names.named, say, log)
 
     def findings(outcome: Outcome, named: torch.Tensor, curves: Curves | None = None) -> Findings:

@@ -16,11 +16,12 @@ from pace_optim.joints.fits.fitted import Fitted
 _RIDGE = 1e-12
 
 
-def pool(fits: Fits, outcome: Outcome, log: Log = unlogged) -> Outcome:
+def pool(fits: Fits, outcome: Outcome, floor: torch.Tensor, log: Log = unlogged) -> Outcome:
     """Give each effect found on several joints of one type one value for all of them, where that explains as much.
 
     The value is the joints' mean, weighted by how well each is known beside its other parameters (the Schur
     complement of the Gauss–Newton matrix, over the squared error); the other parameters are fitted again with it held.
+    Far from the floor (n,) [rad] what is missing hides whether the values differ, and each joint keeps its own.
     """
     if outcome.final.jacobian is None and outcome.cfg.has("pool"):
         outcome = replace(outcome, final=fits.looked_at(outcome.problem, [outcome.final])[0])
@@ -28,7 +29,7 @@ def pool(fits: Fits, outcome: Outcome, log: Log = unlogged) -> Outcome:
         types = {outcome.final.model.joint_type(j) for j in has.nonzero()[:, 0].tolist()}
         if not outcome.cfg.has("pool") or effect.shared or effect in outcome.base.model.effects or int(has.sum()) < 2:
             continue
-        if len(types) > 1:
+        if len(types) > 1 or bool((outcome.far(floor) & has).any()):
             continue
         held = _held(outcome, effect, has)
         fitted = fits.side_by_side(outcome.problem, [held], fits.cfg.again, keep_jacobian=True)[0]

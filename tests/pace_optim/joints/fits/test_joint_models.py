@@ -68,7 +68,7 @@ def test_a_slide_shares_no_value_with_a_hinge_and_is_not_hidden_by_its_error(ben
             problem=None, base=Fitted.start(two_of(JointModel.base(bench.problem)), bench.truth_values.repeat(2, 1)),
             base_errors=errors_of(*rmse), final=now, final_errors=errors_of(*rmse),
         )  # fmt: skip
-        final = pool(FakeFits(lambda *_: errors_of(*after)), outcome).final
+        final = pool(FakeFits(lambda *_: errors_of(*after)), outcome, torch.tensor(rmse)).final
         return final.model.to_physical(final.x)[:, model.columns(STRIBECK)] if final.model.shared else None
 
     assert pooled([False, False], [1e-3, 1e-6], [1e-3, 1e-5]) is None
@@ -88,7 +88,7 @@ def test_one_value_is_shared_where_that_explains_as_much(bench):
     final = replace(Fitted.start(model, physical), jacobian=jacobian)
     weights = torch.ones(1).double()
     errors = BlockErrors(square=torch.tensor([[1e-8, 1e-8]]).double(), weight=weights)
-    for cost, shared in ((1.0, True), (1.3, False)):
+    for cost, floor, shared in ((1.0, 1e-4, True), (1.3, 1e-4, False), (1.0, 1e-5, False)):  # the last: far from it
         after = BlockErrors(square=cost * errors.square, weight=weights)
         outcome = Outcome(
             problem=None,
@@ -97,7 +97,7 @@ def test_one_value_is_shared_where_that_explains_as_much(bench):
             final=final,
             final_errors=errors,
         )
-        outcome = pool(FakeFits(lambda _, after=after: after), outcome)
+        outcome = pool(FakeFits(lambda _, after=after: after), outcome, torch.full((2,), floor))
         assert (STRIBECK in outcome.final.model.shared) is shared
         values = outcome.final.model.to_physical(outcome.final.x)[:, model.columns(STRIBECK)]
         if shared:
