@@ -77,6 +77,8 @@ class Round:
     def with_doubtful(self, unexplained: torch.Tensor) -> Round:
         """The same with all effects as rivals that lose to the chosen one by less than what no model explains may do.
 
+        An effect that left less, and lost by another rule, stays none.
+
         Args:
             unexplained: Of each joint, squared error of the final model above the floor, (n,) [rad²].
         """
@@ -85,7 +87,8 @@ class Round:
             least = next((t.mse_after for t in trials if t.effect is chosen), None)
             if least is not None:
                 most = least + UNEXPLAINED * float(unexplained[j])
-                near = [t.effect for t in trials if t.significant and t.effect is not chosen and t.mse_after <= most]
+                lost = (t for t in trials if t.significant and not t.implausible and least < t.mse_after <= most)
+                near = [t.effect for t in lost]
                 every[j] = [*every[j], *(effect for effect in near if effect not in every[j])]
         return replace(self, rivals=every)
 

@@ -249,6 +249,10 @@ def test_what_stays_unexplained_may_decide_between_effects():
     assert this.with_doubtful(torch.tensor([7.8e-4**2 - 1e-4**2])).rivals == [[QUADRATIC]]
     assert this.with_doubtful(torch.tensor([0.0])).rivals == [[]]
     assert replace(this, chosen=[None]).with_doubtful(torch.tensor([1.0])).rivals == [[]]
+    exchanged = this.exchanged(0, QUADRATIC, tie=False)  # what was put aside for it stays aside
+    assert exchanged.with_doubtful(torch.tensor([0.0])).rivals == [[]]
+    implausible = [trials[0], replace(trials[1], implausible=True)]
+    assert replace(this, trials=[implausible]).with_doubtful(torch.tensor([7.8e-4**2])).rivals == [[]]
 
 
 def test_what_pays_no_longer_beside_what_was_added_is_not_said_to_pay():
