@@ -232,11 +232,15 @@ def _with_loop_rate(run: Optimization, end: _End) -> _End:
 
 
 def _with_step(run: Optimization, end: _End) -> _End:
-    """Add the physics step's part of each error bar."""
-    run.progress.say("simulating with a finer step, to measure the part of the step")
-    physical = end.problem.space.to_physical(end.x)
-    change = change_without_step(end.problem, physical, end.jacobian.residuals, end.at.phases)
-    return replace(end, without_step=change)
+    """Add the physics step's part of each error bar; halve the step where it makes much of the error."""
+    while True:
+        run.progress.say("simulating with a finer step, to measure the part of the step")
+        there = end.jacobian.residuals
+        change = change_without_step(end.problem, end.problem.space.to_physical(end.x), there, end.at.phases)
+        outcome = None if end.is_far else run.at_half_the_step(end.x, there, change)
+        if outcome is None:
+            return replace(end, without_step=change)
+        end = replace(_reached(run, outcome), rates=end.rates)
 
 
 def _with_prior(run: Optimization, end: _End) -> _End:

@@ -47,11 +47,13 @@ _IN_DOUBT = 1.5
 """Times the noise above which pieces are fitted with another structure of effects, and with another loop rate where it
 is assumed."""
 _STEP_IN_DOUBT = 1.3
-"""Times their noise above which torques may show the physics step, ..."""
+"""Times the noise above which a fit may go on at half its physics step ..."""
+_OF_THE_STEP = 0.25
+"""... where the step makes this part of what is above the noise, ..."""
 _OF_TORQUES = 0.7
-"""... which they do where this part of what they leave is left at half of it."""
+"""Part of what torques leave that is left of it at half a physics step that shows."""
 _HALVINGS = 2
-"""Times that a step may be halved."""
+"""... so many times."""
 _FEWEST_GENERATIONS = 5
 """Generations of a search, at least."""
 
@@ -339,6 +341,27 @@ class Optimization:
         """Go on with loops of another period [s], near where a fit of pieces with it ends, normalised (size,)."""
         other = self._way(self.problem.with_loop(period), f"checked loop of {period:g} s")
         return self._ended(other, other.near(x, NEAR))
+
+    def at_half_the_step(self, x: torch.Tensor, there: Residuals, change: torch.Tensor | None) -> Outcome | None:
+        """Go on from the end of a fit at half its physics step, where that shows.
+
+        Args:
+            change: How they would change without a step, (K, R, n) [rad]; ``None``: that is not known.
+
+        Returns:
+            The end at the finer step; its problem is the run's from now on. ``None`` where it is no better.
+        """
+        noise, score = noise_score(self.problem), float(there.score[0])
+        if change is None or not self._may_halve:
+            return None
+        of_step = float(change.square().sum() / there.where.sum())
+        if score <= _STEP_IN_DOUBT**2 * noise or of_step <= _OF_THE_STEP * (score - noise):
+            return None
+        self._halvings += 1
+        finer = self._way_at_half_the_step("checked step")
+        self.progress.say(f"the physics step shows: going on with one of {_ms(finer)}")
+        end = finer.near(x, NEAR)
+        return self._ended(finer, end) if end.score < score else None
 
     def restore(self, checkpoint: dict[str, np.ndarray]) -> None:
         """Bring the optimizers to where the checkpoint has them."""
