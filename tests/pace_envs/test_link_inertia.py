@@ -113,7 +113,7 @@ def fit(problem, iterations: int = 10, held: tuple[str, ...] = ()):
         labels = [label for label in problem.space.labels if label.split("/")[0] in held]
         problem = dataclasses.replace(problem, space=problem.space.holding(labels, physical))
     evaluator = problem.training_evaluator()
-    start = problem.space.start.clone()
+    start = balanced_start(problem)[0]
     known = {name: value for name, value in TRUE.items() if name != "encoder_bias"}
     for name, value in known.items():
         physical = problem.space.to_physical(start)
