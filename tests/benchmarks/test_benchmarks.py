@@ -98,6 +98,7 @@ def test_effort_delay_gets_a_recording_of_its_own_with_the_same_truth(tmp_path):
     assert identification.reference_recording("command", tmp_path) == Path(problem.env_cfg.sim2real.data_dir)
 
 
+@pytest.mark.slow
 def test_the_joint_search_stops_after_its_time_and_tells_what_was_known_by_then():
     run = identification.joint_search(load_problem(identification.TASK), seconds=0.01, population=4)
     assert len(run.seconds) == 1 and run.seconds[0] > 0.01

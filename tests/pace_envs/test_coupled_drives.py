@@ -143,6 +143,7 @@ def test_the_plant_moves_as_the_true_parameters_say(wrist):
     assert float(error.square().mean().sqrt()) < 1e-4
 
 
+@pytest.mark.slow
 def test_compiled_drives_move_as_stepped_ones(wrist):
     steps = torch.arange(0, 300, 7)
     compiled = moved(wrist.problem, wrist.truth).positions(steps)

@@ -56,6 +56,7 @@ def bounds_corners(name):
     return {f"{name}.{p.name}": [c[i] for c in corners] for i, p in enumerate(parameters)}, len(corners)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("calls", "integrator"), [(1, "implicitfast"), (2, "implicitfast"), (2, "leapfrog")])
 @pytest.mark.parametrize("delay_mode", ["command", "effort"])
 def test_at_their_null_all_effects_are_the_base_model_bit_for_bit(delay_mode, calls, integrator):
@@ -353,6 +354,7 @@ def test_effects_compose_in_any_order(effects, values):
             assert rms(one, Bench([name], own).follow(moving, sensed=True)) > 1e-4, name
 
 
+@pytest.mark.slow
 def test_the_stiffest_transmission_is_the_rigid_drive_the_more_the_finer_the_step():
     calm = 0.15 * MOVING[:200]
     values = {"joint_elasticity.stiffness": 2e4, "joint_elasticity.damping": 20.0}
@@ -363,6 +365,7 @@ def test_the_stiffest_transmission_is_the_rigid_drive_the_more_the_finer_the_ste
     assert apart[1] < 0.4 * apart[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("calls", "integrator", "tolerance"), [(1, "implicitfast", 0.05), (5, "implicitfast", 0.01), (2, "leapfrog", 0.02)]
 )

@@ -111,6 +111,7 @@ def rooms_of(package: str) -> dict[str, set[str]]:
 PACKAGES = sorted({str(Path(path).parent) for path in files_of("pace_actuators", "pace_envs", "pace_optim")})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", PACKAGES)
 def test_the_rooms_of_a_package_have_an_order(package):
     """No arrow up: there is an order in which each room imports from rooms before it alone."""

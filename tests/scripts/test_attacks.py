@@ -122,6 +122,7 @@ def elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("carrier", CARRIERS)
 @pytest.mark.parametrize("fmt", FORMATS)
 def test_an_exported_page_runs_nothing_of_a_name(fmt, carrier, tmp_path, monkeypatch):

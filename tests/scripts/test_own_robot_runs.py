@@ -92,6 +92,7 @@ def test_what_a_run_keeps(project):
     assert mujoco.MjModel.from_binary_path(str(run / "model.mjb")).joint(0).name == "hinge"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("script", "words"),
     [

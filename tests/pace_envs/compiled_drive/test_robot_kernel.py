@@ -92,6 +92,7 @@ def test_an_effect_that_reads_the_link_is_left_to_the_environment(bench, name):
     assert not compiled and torch.equal(expected, got)
 
 
+@pytest.mark.slow
 def test_a_robot_of_several_joints_that_move_each_other():
     cfg = env_cfg(ANYMAL)
     problem = make_problem(record(legs_chirp(cfg, 0.3), TRUTH, cfg=cfg), cfg=cfg)

@@ -151,6 +151,7 @@ def test_a_slides_encoder_has_steps_of_a_tenth():
     assert step == pytest.approx([2 * np.pi / 4096, 0.2 * np.pi / 4096])
 
 
+@pytest.mark.slow
 def test_a_recording_is_as_noisy_as_asked_for(tmp_path):
     options = (*BENCH, "--duration", "2", "--no_plot")
     exact, noisy = record(tmp_path, *options), record(tmp_path, *options, "--noise", "1e-3")
@@ -368,6 +369,7 @@ def test_help_shows_an_example(name, capsys):
     assert f"example:\n  scripts/{name}.py" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_scripts_run_from_anywhere(warm, tmp_path):
     done = warm.run(ROOT / "scripts" / "data_collection.py", "--task", "Pace-Testbench-v0", cwd=tmp_path)
     assert done.returncode == 2 and done.stdout == ""

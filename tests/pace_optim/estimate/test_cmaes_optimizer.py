@@ -73,6 +73,7 @@ def test_the_truth_is_found_on_the_bench(delay_mode):
     assert range_error(problem, optimizer.best, truth) < 0.01
 
 
+@pytest.mark.slow
 def test_several_recordings_are_searched_together():
     problem = make_problem([record(chirp(0.3)), record(chirp(0.3), drive={"stiffness": 40.0})])
     optimizer = run(problem, generations=100, criteria=[TargetScore(1e-9)])

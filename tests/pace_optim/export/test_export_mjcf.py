@@ -352,6 +352,7 @@ def test_an_identified_mass_holds_where_a_file_weighs_geoms_or_all_bodies_togeth
     env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", ["newton", "mjlab_native"])
 def test_pages_for_other_simulators_move_so_in_plain_steps_too(tmp_path, page):
     """They had the identified armature and kd: at steps of 0.5 ms, an xArm 7 moved 2 mrad beside its fit."""

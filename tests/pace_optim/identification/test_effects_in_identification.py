@@ -198,6 +198,7 @@ def without(bench_and_twin):
     return [replay(problem, CALM) for problem in bench_and_twin]
 
 
+@pytest.mark.slow
 def test_the_twin_of_a_joint_moves_as_the_robot(without):
     assert rms(*without) < 2e-4
 

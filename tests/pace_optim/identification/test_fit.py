@@ -194,6 +194,7 @@ def test_hybrid_is_never_worse_than_either_alone(delay_mode, recordings, tmp_pat
     assert scores["hybrid"] <= (1 + 1e-6) * min(scores.values())
 
 
+@pytest.mark.slow
 def test_several_recordings_with_validation_files_are_fitted_together(recordings, tmp_path, no_report):
     result, folder = run(tmp_path, recordings["noisy"], recordings["soft"], validation=[recordings["heavy"]])
     assert result.recordings == {"train": ["noisy", "soft"], "validation": ["heavy"]}
@@ -207,6 +208,7 @@ def test_several_recordings_with_validation_files_are_fitted_together(recordings
     assert json.loads((folder / "consistency.json").read_text())["recordings"] == ["noisy", "soft"]
 
 
+@pytest.mark.slow
 def test_validation_data_do_not_touch_the_result(recordings, tmp_path, no_report):
     first, _ = run(tmp_path, recordings["noisy"], validation=[recordings["heavy"]], optimizer="least_squares")
     other, _ = run(tmp_path, recordings["noisy"], validation=[recordings["wrong"]], optimizer="least_squares")
@@ -222,6 +224,7 @@ def test_a_finer_physics_step_and_a_delay_mode_are_kept_in_the_result(recordings
     assert result.delay_s == pytest.approx(0.0025 * result.parameters["delay"]["all"])
 
 
+@pytest.mark.slow
 def test_assumptions_are_told_once_and_before_the_search(recordings, tmp_path, no_report, capsys):
     result, _ = run(tmp_path, recordings["clean"], optimizer="least_squares")
     told = capsys.readouterr().err
@@ -229,11 +232,13 @@ def test_assumptions_are_told_once_and_before_the_search(recordings, tmp_path, n
     assert not any(note in line for note in result.notes for line in summary(result))
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_result(recordings, whole, tmp_path, no_report):
     (first, _), (second, _) = whole("noisy", optimizer="hybrid"), run(tmp_path, recordings["noisy"], optimizer="hybrid")
     assert first.parameters == second.parameters and first.score == second.score
 
 
+@pytest.mark.slow
 def test_two_runs_in_the_same_second_have_folders_of_their_own(recordings, tmp_path, no_report):
     folders = {run(tmp_path, recordings["clean"], optimizer="cmaes", max_iteration=1)[1] for _ in range(2)}
     assert len(folders) == 2
@@ -341,6 +346,7 @@ def test_interrupted_before_anything_is_known_still_ends_cleanly(recordings, tmp
     assert result.stop_reasons == ["interrupted"] and (folder / "result.json").is_file()
 
 
+@pytest.mark.slow
 def test_a_result_is_written_before_it_is_checked_and_an_interrupted_check_leaves_it(
     recordings, tmp_path, no_report, monkeypatch
 ):
@@ -373,6 +379,7 @@ def test_a_finished_run_resumes_to_itself(recordings, tmp_path, no_report):
         assert same_result(resumed, whole), optimizer
 
 
+@pytest.mark.slow
 def test_a_resumed_search_may_be_given_more_generations(recordings, tmp_path, no_report):
     whole, _ = run(tmp_path, recordings["noisy"], optimizer="cmaes", max_iteration=6)
     _, folder = run(tmp_path, recordings["noisy"], optimizer="cmaes", max_iteration=3)

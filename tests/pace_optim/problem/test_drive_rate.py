@@ -45,6 +45,7 @@ def test_the_effect_explains_the_motion_of_a_drive_that_runs_continuously(tmp_pa
     assert follows < 0.1 * held
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("drive_dt", "physics_dt"),
     [(0.001, 0.0005), (0.005, 0.0025), (0.0025, 0.0025), (0.0007, 0.0025 / 7), (0.004, 0.0005)],

@@ -48,6 +48,7 @@ def _energy(model, position, speed):
     return np.array(result)
 
 
+@pytest.mark.slow
 def test_what_gravity_takes_is_the_slope_of_the_potential_energy(model):
     position, still = np.linspace(-0.3, 0.6, 901)[:, None], np.zeros((901, 1))
     torque = LinkMotion.of(model, ROOT, position, still, still).torque()[:, 0]

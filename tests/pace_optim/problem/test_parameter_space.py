@@ -138,6 +138,7 @@ def test_declarations_that_do_not_fit_are_named():
         parameter(upper=(2.0, math.inf))
 
 
+@pytest.mark.slow
 def test_one_declaration_adds_a_parameter_that_a_fit_recovers():
     def apply(env, values):
         env.scene["robot"].actuators["servo"].saturation_effort[:] = values

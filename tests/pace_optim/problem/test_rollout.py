@@ -113,6 +113,7 @@ def unlike_recordings():
     ]
 
 
+@pytest.mark.slow
 def test_each_recording_is_simulated_with_its_own_facts(monkeypatch):
     # drives that pay to be compiled round the last digit otherwise, and here only some do
     monkeypatch.setattr("pace_envs.compiled_drive.robot_kernel.CompiledRobot.positions", lambda *_: None)

@@ -45,6 +45,7 @@ def steps_of(problem, x):
     return space.to_physical(x - whole @ (gradient / scale) / scale), residuals, jacobian
 
 
+@pytest.mark.slow
 def test_swinging_legs_have_the_truth_at_the_bottom_of_their_error(walk):
     problem, truth = walk
     found, residuals, jacobian = steps_of(problem, problem.space.to_normalised(truth))
@@ -324,6 +325,7 @@ def test_a_leg_that_stands_throughout_is_named(tmp_path):
     assert any("rr_hip, rr_knee: always held by the ground" in note for note in problem.dataset.recordings[0].notes)
 
 
+@pytest.mark.slow
 def test_legs_on_which_no_foot_is_named_are(tmp_path):
     simulated = crawler(1).simulate(1.0)
     problem, _ = walking_problem(

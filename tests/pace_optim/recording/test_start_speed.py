@@ -49,6 +49,7 @@ def test_recordings_of_an_arm_in_motion_have_the_speeds_that_were_recorded_besid
         assert found == pytest.approx(recorded, abs=0.02)
 
 
+@pytest.mark.slow
 def test_the_first_second_is_left_out_where_no_slope_can_be_told():
     recording = record(np.zeros((2001, 1)))
     rough = np.random.default_rng(0).uniform(-0.1, 0.1, 40)

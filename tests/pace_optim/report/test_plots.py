@@ -73,6 +73,7 @@ def test_a_beginning_that_settles_is_not_called_validation():
     assert not figure.axes[0].patches and "validation" not in figure.axes[0].get_title(loc="right")
 
 
+@pytest.mark.slow
 def test_many_joints_go_on_several_figures_and_odd_names_into_file_names():
     names = [f"joint_{i}" for i in range(29)]
     recording = make_trajectory(50)["recordings"][0]
@@ -88,12 +89,14 @@ def test_many_joints_go_on_several_figures_and_odd_names_into_file_names():
     assert [title for title in shown if title] == names
 
 
+@pytest.mark.slow
 def test_a_simulation_that_diverged_is_drawn_as_far_as_it_goes(tmp_path):
     trajectory = make_trajectory(100)
     trajectory["recordings"][0]["sim_dof_pos"][40:] = torch.nan
     drawn(trajectory)["trajectory_chirp"].savefig(tmp_path / "a.png")
 
 
+@pytest.mark.slow
 def test_a_figure_can_be_saved_without_a_display(figures, tmp_path):
     figures["trajectory_chirp"].savefig(tmp_path / "a.png", dpi=50)
     assert (tmp_path / "a.png").stat().st_size > 10_000

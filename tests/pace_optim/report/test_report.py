@@ -149,6 +149,7 @@ def test_values_that_are_no_numbers_do_not_break_it(tmp_path):
     assert "trajectories" in page_of(folder).ids
 
 
+@pytest.mark.slow
 def test_twelve_joints_stay_below_three_megabytes(tmp_path):
     names = [f"joint_{i}" for i in range(12)]
     folder = write_run(tmp_path / "run", make_result(joint_names=names))

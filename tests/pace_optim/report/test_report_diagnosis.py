@@ -39,6 +39,7 @@ def test_it_says_what_is_missing_and_on_what_evidence(tmp_path):
     assert "pre" in page.tags and not page.unbalanced
 
 
+@pytest.mark.slow
 def test_the_run_with_what_was_missing_is_not_told_to_add_it(tmp_path):
     with_it = folder_with(tmp_path / "with", make_diagnosis())
     make_result(effects=["stribeck_friction"]).save(with_it / "result.json")

@@ -111,6 +111,7 @@ def test_the_comparison_tells_each_in_its_unit(fitted):
     assert "position [m]" in data and "position [rad]" in data and "load force [N]" in data
 
 
+@pytest.mark.slow
 def test_its_pictures_name_the_unit_of_each_axis(fitted, tmp_path):
     run, _ = fitted
     types = FitResult.load(run).joint_types

@@ -35,6 +35,7 @@ def searched(file, tmp_path_factory):
     return fit(settings, Silent())[1]
 
 
+@pytest.mark.slow
 def test_config_holds_the_data_set_by_paces_names(searched):
     config = torch.load(searched / "config.pt", weights_only=True)
     assert config["bounds"].shape == (5, 2) and config["joint_order"] == ["servo"]
@@ -66,6 +67,7 @@ def test_a_plot_needs_no_more_than_the_runs_folder(searched, tmp_path):
     assert list(tmp_path.glob("*.png"))
 
 
+@pytest.mark.slow
 def test_least_squares_keep_a_mean_of_each_iteration_and_can_be_plotted_meanwhile(file, tmp_path, monkeypatch):
     after = Optimization._after_iteration
 

@@ -85,6 +85,7 @@ def test_the_plant_shares_no_code_with_the_model(path):
 # --- integration
 
 
+@pytest.mark.slow
 def test_a_free_swing_keeps_its_energy():
     truth = Truth(base=BaseTruth(armature=0.1, viscous_friction=0.0, friction=0.0, delay=0.0))
     q = positions(truth, [run_of(np.full((4000, 1), 1.2), drive=FREE)])[0].dof_pos[:, 0]

@@ -355,6 +355,7 @@ def test_a_hint_has_its_size_and_how_far_that_goes_apart(bench):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stopped", ["converged", "interrupted"])
 def test_it_is_fitted_to_the_whole_robot_all_the_same(run, bench, monkeypatch, stopped):
     outcome = ended(bench, 5e-3, (SPRING, [True], [2.0, 0.1]))

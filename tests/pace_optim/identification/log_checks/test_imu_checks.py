@@ -52,6 +52,7 @@ def test_an_imu_that_is_late_is_found_with_its_delay(view):
     assert float(found[0].text.split(" ms")[0].split()[-1]) == pytest.approx(1e3 * DT * steps, abs=1.0)
 
 
+@pytest.mark.slow
 def test_an_imu_that_is_late_is_shifted_for_the_fit(problem):
     late = replace(problem.with_imu_delays({"walk": -3 * DT}), imu_delays={})
     found = checked(late)

@@ -43,6 +43,7 @@ def test_a_clean_log_has_no_findings(seed, tmp_path):
     assert found_in("clean", seed, tmp_path)[1] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", FAULTS)
 def test_a_fault_is_named_with_its_joints(kind, tmp_path):
     made, found = found_in(kind, 0, tmp_path)

@@ -182,6 +182,7 @@ def test_a_crank_feels_what_follows_it(tmp_path, model):
     assert float((moved_by(twins, other) - moved_by(whole, other)).abs().max()) < 2e-3
 
 
+@pytest.mark.slow
 def test_effects_of_hinges_are_asked_for_on_a_robot_with_a_slide_too(tmp_path):
     path = tmp_path / "arm.xml"
     path.write_text(
@@ -200,6 +201,7 @@ def test_effects_of_hinges_are_asked_for_on_a_robot_with_a_slide_too(tmp_path):
     assert float(path.model_effects["payload", "ratio"].inertia[..., 1].min()) > 0.01
 
 
+@pytest.mark.slow
 def test_a_spring_at_a_joint_acts_on_it_alone_too(tmp_path):
     path = tmp_path / "arm.xml"
     path.write_text(

@@ -127,6 +127,7 @@ def test_each_tree_takes_its_own_best(tmp_path):
     assert np.array_equal(chosen.trajectory.des_dof_pos, again.trajectory.des_dof_pos)
 
 
+@pytest.mark.slow
 def test_a_joint_without_amplitude_rests_while_the_other_is_optimised(tmp_path):
     cfg = pendulums_cfg(tmp_path)
     cfg.sim2real.excitation = ExcitationCfg(bias=(0.0, 0.0), direction=(1.0, 1.0), scale=(0.3, 0.0))

@@ -105,6 +105,7 @@ def short(tmp_path):
     return settings(log, tmp_path / "runs", unknown=GAINS, physics_dt=CONTROL_DT)
 
 
+@pytest.mark.slow
 def test_a_fit_that_is_interrupted_in_its_checks_is_not_followed_by_one_with_torques(short, monkeypatch):
     """Ctrl-C began a second fit; the first one's --resume then counted it as ended."""
 
@@ -120,6 +121,7 @@ def test_a_fit_that_is_interrupted_in_its_checks_is_not_followed_by_one_with_tor
     assert goes_on == "goes on" and not resumed.is_interrupted
 
 
+@pytest.mark.slow
 def test_the_second_fit_with_torques_follows_a_resumed_first_one(short, tmp_path, monkeypatch):
     first, folder = fit(short)
     replace(first, contested=["stiffness"]).save(folder / "result.json")
