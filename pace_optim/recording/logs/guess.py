@@ -20,7 +20,19 @@ from .base import guess_base
 from .column_map import ColumnMap, Source
 from .log import Channel, Log
 from .units import Known, guessed_units, no_slopes
-from .words import CURRENTS, GAINS, NEED_FACTOR, UNITS, is_other, joint_places, match, meaning, only_numbers
+from .words import (
+    CURRENTS,
+    GAINS,
+    NEED_FACTOR,
+    POSITION,
+    UNITS,
+    VELOCITY,
+    is_other,
+    joint_places,
+    match,
+    meaning,
+    only_numbers,
+)
 
 _PLANNED = re.compile(r":(positions|velocities|effort|(desired|reference|output)\.\w+)\[")
 """Of a trajectory or a controller's state: its speeds and torques are those of the plan, which few drives get."""
@@ -100,9 +112,14 @@ def guess_map(log: Log, robot: Robot, channels: Mapping[str, Channel] | None = N
         candidates = [
             c for c in candidates if not is_other(c.label) or _meant(c.label, robot.joint_names, robot.wanted)
         ]
-    if unknown := [c for c in candidates if c.unknown_unit]:
+    unknown = [c for c in candidates if c.unknown_unit]
+    if gains := [c.channel.key for c in unknown if c.series in GAINS.values()]:
         notes.append(
-            f"{listed(c.channel.key for c in unknown)}: the unit is not known, so not used. Map it with a known unit "
+            f"{listed(gains)}: gains, expected SI units (N m/rad, N m s/rad), so not used. State them so with --facts."
+        )
+    if others := [c.channel.key for c in unknown if c.series not in GAINS.values()]:
+        notes.append(
+            f"{listed(others)}: the unit is not known, so not used. Map it with a known unit "
             'and a factor, such as unit = "N m", factor = 0.113.'
         )
     candidates = _once([c for c in candidates if not c.unknown_unit], notes)
@@ -210,12 +227,15 @@ def _candidate(channel: Channel, places: Mapping[str, tuple[int, int]]) -> _Cand
         place = [word for word in said.joint if word.isdigit()]
         label = "_".join(place or [word for word in around if word not in ("controller", "controllers", "forward")])
     commanded = said.commanded and said.quantity in MEASURED_SERIES
+    unknown = said.unknown_unit
+    if unknown.lower() == "raw" and said.quantity in (POSITION, VELOCITY) and np.any(channel.values % 1):
+        unknown = ""  # no counts, so the numbers show the unit
     return _Candidate(
         channel=channel,
         series=("des_" if commanded else "") + said.quantity,
         label=label,
         unit=said.unit,
-        unknown_unit=said.unknown_unit,
+        unknown_unit=unknown,
     )
 
 
