@@ -16,7 +16,7 @@ from pace_actuators.text import listed
 from pace_optim.recording.keys import COMMAND_SERIES, CONDITIONS, JOINT_SERIES, MEASURED_SERIES
 from pace_optim.recording.time_base import held
 
-from .base import guess_base
+from .base import NO_BASE, BaseMap, guess_base
 from .column_map import ColumnMap, Source
 from .log import Channel, Log
 from .units import Known, guessed_units, no_slopes
@@ -98,12 +98,13 @@ class _Candidate:
     unknown_unit: str = ""
 
 
-def guess_map(log: Log, robot: Robot, channels: Mapping[str, Channel] | None = None) -> Guess:
+def guess_map(log: Log, robot: Robot, channels: Mapping[str, Channel] | None = None, base: BaseMap = NO_BASE) -> Guess:
     """Find which channel is which series of which joint.
 
     Args:
         robot: The robot, as far as it is known.
         channels: What units are read from, by key: those of all logs with the same columns (:func:`as_one`).
+        base: What a column map says of the base; it is guessed where that has no channels.
     """
     notes: list[str] = []
     places = joint_places((channel.name for channel in log.channels.values()), robot.joint_names)
@@ -156,7 +157,7 @@ def guess_map(log: Log, robot: Robot, channels: Mapping[str, Channel] | None = N
     switches = [c.channel for c in candidates if c.series == "torque_enable"]
     enable, more = _enable(switches)
     facts_from |= {channel.key for channel in switches} if enable else set()
-    base, of_base = guess_base(log)
+    base, of_base = (base, list[str]()) if base.channels else guess_base(log)
     missing = _missing(sources, robot.wanted or _found(sources, robot, candidates) or names)
     more = [*more, *of_base, *(_foreign(candidates, robot) if missing else [])]
     return Guess(
