@@ -108,7 +108,7 @@ def _of_clocks(new: np.ndarray) -> list[np.ndarray]:
     together = new.T.astype(float) @ new
     count = together.diagonal()
     often = count >= max(2, _OFTEN * count.max())
-    same = (together > _CHANCE * np.outer(count, count) / len(new)) & np.outer(often, often)
+    same = (together > _CHANCE * np.outer(count, count) / max(1, len(new))) & np.outer(often, often)
     number, of = connected_components(same, directed=False)
     return [np.any(new[:, of == k], axis=1) for k in range(number)]
 
