@@ -105,7 +105,9 @@ def _parser() -> Parser:
     robot.add_argument("--arm_mass", type=number, metavar="KG", help="test bench: mass of the arm")
     add_several(robot, "--added_mass", "BODY=KG[@X,Y,Z]", "masses added to bodies", action="extend")
     encoder = parser.add_argument_group("encoder")
-    encoder.add_argument("--noise", type=number, default=0.0, metavar="RAD", help="standard deviation (default 0)")
+    encoder.add_argument(
+        "--noise", type=number, default=0.0, metavar="RAD", help="standard deviation, of slides 0.1 m/rad (default 0)"
+    )
     encoder.add_argument(
         "--encoder_bits", type=int, metavar="B", help="2^B steps per turn, of slides per 0.63 m (default: exact)"
     )

@@ -80,7 +80,7 @@ class Encoder:
     rng: np.random.Generator
     """Source of the noise."""
     radians: tuple[float, ...] = (1.0,)
-    """What counts as a radian of each joint [rad, of slides m]: steps are parts of it."""
+    """What counts as a radian of each joint [rad, of slides m]: noise and steps are parts of it."""
 
     @property
     def is_exact(self) -> bool:
@@ -90,7 +90,7 @@ class Encoder:
     def read(self, position: np.ndarray) -> np.ndarray:
         """Readings of positions [rad], same shape."""
         if self.noise:
-            position = position + self.rng.normal(0.0, self.noise, position.shape)
+            position = position + self.rng.normal(0.0, self.noise, position.shape) * np.array(self.radians)
         if self.bits is not None:
             step = 2 * np.pi / 2**self.bits * np.array(self.radians)
             position = np.round(position / step) * step

@@ -23,7 +23,7 @@ from pace_optim.recording.commands import command_interval
 from pace_optim.recording.conform import of_motors, with_columns
 from pace_optim.recording.files import stated_couplings, unused_facts
 from pace_optim.recording.gaps import split_at_gaps
-from pace_optim.recording.logs import LogReader, Robot, column_names, paired_files, read_map, with_rate
+from pace_optim.recording.logs import LogReader, Robot, column_names, paired_files, read_map, set_aside, with_rate
 
 if TYPE_CHECKING:
     from pace_envs import ManagerBasedEnv
@@ -232,8 +232,8 @@ def _each(
     if faults and not result:
         (_, first), *others = faults
         raise ValueError(first + (f" Neither can {listed(name for name, _ in others)} be used." if others else ""))
-    for _, fault in faults:
-        tell(f"warning: set aside (--strict would refuse all): {fault} [W20]")
+    for name, fault in faults:
+        tell(set_aside(name, fault))
     return result
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from pace_actuators.drive_result import CommandTiming
 
@@ -19,6 +20,8 @@ _EVEN = 2e-3
 """An interval this near to a tenth of a millisecond or to a whole number of Hz is that."""
 _OFTEN = 0.1
 """Part of the changes of the most active joint's command that show another joint's interval."""
+_CHANCE = 0.5
+"""Part of the common changes that chance would have, of which commands of one clock have more."""
 _FOLLOWS = 0.1
 """Part of a command's deviation by which the ticks that are counted follow the timer, whose rate is not known yet."""
 
@@ -73,7 +76,7 @@ def acting_loops(recording: Recording, stiffness: np.ndarray) -> tuple[np.ndarra
 def command_interval(recording: Recording) -> float:
     """Time from one command to the next, as they were logged [s]: repeated commands do not count.
 
-    Instants of a separate clock may be those of several joints' clocks together: the interval is that of one joint.
+    Instants of a separate clock may be those of several clocks together: the interval is that of one of them.
 
     Args:
         recording: As `load_recording` gives it.
@@ -84,7 +87,7 @@ def command_interval(recording: Recording) -> float:
     if len(every) != len(instants):  # one for each control step
         instants = np.linspace(instants[0], instants[-1], len(every))
     new = np.diff(every, axis=0) != 0
-    changed = [new.any(axis=1)] if recording.des_time is None else list(new.T)
+    changed = [np.any(new, axis=1)] if recording.des_time is None else _of_clocks(new)
     most = max(int(each.sum()) for each in changed)
     steps = [np.diff(instants[1:][each]) for each in changed if each.sum() >= max(2, _OFTEN * most)]
     if not steps:  # no command follows another: as often as there are commands, or samples
@@ -92,6 +95,22 @@ def command_interval(recording: Recording) -> float:
     interval = min(float(np.median(each)) for each in steps)
     even = min((1 / max(1, round(1 / interval)), round(interval, 4)), key=lambda each: abs(each - interval))
     return even if abs(even / interval - 1) < _EVEN else interval
+
+
+def _of_clocks(new: np.ndarray) -> list[np.ndarray]:
+    """When the commands of each clock change, (T,) bool each.
+
+    Commands of one clock change at the same instant about as often as chance has it, those of two clocks hardly ever.
+
+    Args:
+        new: When each command changes, (T, n) bool.
+    """
+    together = new.T.astype(float) @ new
+    count = together.diagonal()
+    often = count >= max(2, _OFTEN * count.max())
+    same = (together > _CHANCE * np.outer(count, count) / max(1, len(new))) & np.outer(often, often)
+    number, of = connected_components(same, directed=False)
+    return [np.any(new[:, of == k], axis=1) for k in range(number)]
 
 
 def command_timing(recordings: Iterable[Recording]) -> CommandTiming | None:

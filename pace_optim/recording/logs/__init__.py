@@ -4,7 +4,7 @@
 """
 
 from .column_map import ColumnMap, read_map, with_rate, write_map
-from .load import LogReader, Robot, column_names, is_log, paired_files
+from .load import LogReader, Robot, column_names, is_log, paired_files, set_aside
 
 __all__ = [
     "ColumnMap",
@@ -14,6 +14,7 @@ __all__ = [
     "is_log",
     "paired_files",
     "read_map",
+    "set_aside",
     "with_rate",
     "write_map",
 ]

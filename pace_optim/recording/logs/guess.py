@@ -16,11 +16,23 @@ from pace_actuators.text import listed
 from pace_optim.recording.keys import COMMAND_SERIES, CONDITIONS, JOINT_SERIES, MEASURED_SERIES
 from pace_optim.recording.time_base import held
 
-from .base import guess_base
+from .base import NO_BASE, BaseMap, guess_base
 from .column_map import ColumnMap, Source
 from .log import Channel, Log
 from .units import Known, guessed_units, no_slopes
-from .words import CURRENTS, GAINS, NEED_FACTOR, UNITS, is_other, joint_places, match, meaning, only_numbers
+from .words import (
+    CURRENTS,
+    GAINS,
+    NEED_FACTOR,
+    POSITION,
+    UNITS,
+    VELOCITY,
+    is_other,
+    joint_places,
+    match,
+    meaning,
+    only_numbers,
+)
 
 _PLANNED = re.compile(r":(positions|velocities|effort|(desired|reference|output)\.\w+)\[")
 """Of a trajectory or a controller's state: its speeds and torques are those of the plan, which few drives get."""
@@ -86,12 +98,13 @@ class _Candidate:
     unknown_unit: str = ""
 
 
-def guess_map(log: Log, robot: Robot, channels: Mapping[str, Channel] | None = None) -> Guess:
+def guess_map(log: Log, robot: Robot, channels: Mapping[str, Channel] | None = None, base: BaseMap = NO_BASE) -> Guess:
     """Find which channel is which series of which joint.
 
     Args:
         robot: The robot, as far as it is known.
         channels: What units are read from, by key: those of all logs with the same columns (:func:`as_one`).
+        base: What a column map says of the base; it is guessed where that has no channels.
     """
     notes: list[str] = []
     places = joint_places((channel.name for channel in log.channels.values()), robot.joint_names)
@@ -100,9 +113,14 @@ def guess_map(log: Log, robot: Robot, channels: Mapping[str, Channel] | None = N
         candidates = [
             c for c in candidates if not is_other(c.label) or _meant(c.label, robot.joint_names, robot.wanted)
         ]
-    if unknown := [c for c in candidates if c.unknown_unit]:
+    unknown = [c for c in candidates if c.unknown_unit]
+    if gains := [c.channel.key for c in unknown if c.series in GAINS.values()]:
         notes.append(
-            f"{listed(c.channel.key for c in unknown)}: the unit is not known, so not used. Map it with a known unit "
+            f"{listed(gains)}: gains, expected SI units (N m/rad, N m s/rad), so not used. State them so with --facts."
+        )
+    if others := [c.channel.key for c in unknown if c.series not in GAINS.values()]:
+        notes.append(
+            f"{listed(others)}: the unit is not known, so not used. Map it with a known unit "
             'and a factor, such as unit = "N m", factor = 0.113.'
         )
     candidates = _once([c for c in candidates if not c.unknown_unit], notes)
@@ -139,7 +157,7 @@ def guess_map(log: Log, robot: Robot, channels: Mapping[str, Channel] | None = N
     switches = [c.channel for c in candidates if c.series == "torque_enable"]
     enable, more = _enable(switches)
     facts_from |= {channel.key for channel in switches} if enable else set()
-    base, of_base = guess_base(log)
+    base, of_base = (base, list[str]()) if base.channels else guess_base(log)
     missing = _missing(sources, robot.wanted or _found(sources, robot, candidates) or names)
     more = [*more, *of_base, *(_foreign(candidates, robot) if missing else [])]
     return Guess(
@@ -210,12 +228,15 @@ def _candidate(channel: Channel, places: Mapping[str, tuple[int, int]]) -> _Cand
         place = [word for word in said.joint if word.isdigit()]
         label = "_".join(place or [word for word in around if word not in ("controller", "controllers", "forward")])
     commanded = said.commanded and said.quantity in MEASURED_SERIES
+    unknown = said.unknown_unit
+    if unknown.lower() == "raw" and said.quantity in (POSITION, VELOCITY) and np.any(channel.values % 1):
+        unknown = ""  # no counts, so the numbers show the unit
     return _Candidate(
         channel=channel,
         series=("des_" if commanded else "") + said.quantity,
         label=label,
         unit=said.unit,
-        unknown_unit=said.unknown_unit,
+        unknown_unit=unknown,
     )
 
 

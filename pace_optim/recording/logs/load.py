@@ -22,7 +22,7 @@ from pace_optim.recording.keys import COMMAND_SERIES, CONDITIONS, DRIVE_FACTS, M
 from pace_optim.recording.text_table import Head, head_of
 from pace_optim.recording.time_base import held, interpolate_linear, interpolate_smooth
 
-from .base import base_fields
+from .base import NO_BASE, base_fields
 from .column_map import ColumnMap, Source, map_text, printable, write_map
 from .guess import Robot, as_one, guess_map
 from .log import Channel, Log
@@ -37,6 +37,38 @@ _OWN = {"dof_pos", "des_dof_pos"}
 """One of these is in every recording of this project's own form."""
 _JOIN = "+"
 """Between the files of one log: states.csv+commands.csv."""
+
+
+class _IncompleteError(ValueError):
+    """A log without series that a recording needs."""
+
+    def __init__(self, path: Path, log: Log, missing: Sequence[str], columns: ColumnMap, notes: Sequence[str]):
+        super().__init__(
+            printable(
+                f"{path}: missing {'; '.join(missing)}. The log holds {listed(log.channels, 24)}. {' '.join(notes)}"
+            )
+        )
+        known = (f"{key}: {len(each.time)} values at {each.rate:.4g} Hz" for key, each in log.channels.items())
+        self._columns = columns if columns.joints else replace(columns, joints={"JOINT": {}})
+        self._target = Path(f"{log.name.replace(' ', '_')}_map.toml")
+        self._head = (
+            f"Guessed from {path}; correct it and give it with --columns. Missing: {'; '.join(missing)}.",
+            *notes,
+            'Entries: {from = "COLUMN", unit = "deg", sign = -1, offset = 0.1, gear_ratio = 9.0, factor = 1.2}',
+            "The log holds:",
+            *known,
+        )
+
+    def with_map(self) -> ValueError:
+        """The message with a map to correct, which is written."""
+        target = _free(self._target)
+        try:
+            write_map(target, self._columns, self._head)
+            quoted = shlex.quote(str(target))
+            where = f"What was guessed is in {target}: complete it and give it with --columns {quoted}."
+        except OSError:
+            where = "Give a column map with --columns:\n" + map_text(self._columns)
+        return ValueError(printable(f"{self} {where}"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,6 +110,7 @@ class LogReader:
         self._alike: dict[frozenset[str], list[Log]] = {}
         self._together: dict[frozenset[str], dict[str, Channel]] = {}
         self._readings: dict[str, _Reading] = {}
+        self._refused: dict[str, _Reading] = {}
         for path in paths:
             if is_log(Path(path), columns):
                 with suppress(ValueError):  # it is raised when the path's turn comes
@@ -92,7 +125,8 @@ class LogReader:
     def understood(self, path: str, robot: Robot) -> list[tuple[Recording, ColumnMap]]:
         """The recordings of a log, one or one per episode, and which column was taken for what."""
         columns = self._columns
-        self._readings.pop(str(Path(path)), None)
+        for readings in (self._readings, self._refused):
+            readings.pop(str(Path(path)), None)
         found: list[tuple[Recording, ColumnMap]] = []
         faults: dict[str, ValueError] = {}
         try:
@@ -106,24 +140,23 @@ class LogReader:
             if faults and not found:
                 raise next(iter(faults.values()))
         except ValueError as error:
-            if columns is None or columns.source in str(error):
-                raise
-            raise ValueError(f"{error} ({Path(path).name} was read by {columns.source}.)") from None
-        self._set_aside[path] = [
-            f"warning: {name} is set aside: {' '.join(str(error).split())} [W20]" for name, error in faults.items()
-        ]
+            fault = error.with_map() if isinstance(error, _IncompleteError) else error
+            if columns is None or columns.source in str(fault):
+                raise fault from None
+            raise ValueError(f"{fault} ({Path(path).name} was read by {columns.source}.)") from None
+        self._set_aside[path] = [set_aside(name, error) for name, error in faults.items()]
         return found
 
     def lines(self) -> list[str]:
         """How the logs were read so far, those that were read alike together."""
         alike: list[list[_Reading]] = []
-        for reading in self._readings.values():
+        for reading in (self._refused | self._readings).values():
             group = next((each for each in alike if each[0].columns.joints == reading.columns.joints), None)
             if group is None:
                 alike.append([reading])
             else:
                 group.append(reading)
-        of_facts = [f"note: {self._note}"] if self._note else []
+        of_facts = [printable(f"note: {self._note}")] if self._note else []
         of_readings = [line for group in alike for line in _lines(group)]
         return [*of_readings, *of_facts, *(line for lines in self._set_aside.values() for line in lines)]
 
@@ -148,13 +181,12 @@ class LogReader:
         beside = _parts(path)[0]
         stated, of_facts = facts_beside(beside)
         if used is None or not used.joints:
-            guess = guess_map(log, robot, self._channels(log))
+            guess = guess_map(log, robot, self._channels(log), NO_BASE if used is None else used.base)
             own, facts_from, unit_stated = guess.columns, guess.facts_from, guess.unit_stated
-            base = own.base if used is None or not used.base.channels else used.base
-            used = own if used is None else replace(used, joints=own.joints, torque_enable=own.torque_enable, base=base)
+            used = replace(used or own, joints=own.joints, torque_enable=own.torque_enable, base=own.base)
             notes += guess.notes
             if guess.missing:
-                raise ValueError(_what_is_missing(path, log, guess.missing, used, notes))
+                raise _IncompleteError(path, log, guess.missing, used, notes)
             used = replace(used, facts={**own.facts, **used.facts})
             if twice := [key for key in own.facts if key in stated]:
                 notes.append(f"{listed(twice)}: as the JSON file beside the log states it, not by the log's columns.")
@@ -163,17 +195,24 @@ class LogReader:
         fields, more = fields_of(log, used, names)
         left = unused(log, used, facts_from)
         notes += [*more, *of_facts, *([left] if left else [])]
-        self._readings.setdefault(str(path), _Reading(path=path, log=log, columns=used, notes=tuple(notes)))
+        reading = _Reading(path=path, log=log, columns=used, notes=tuple(notes))
         fields = with_shared_facts(with_facts(fields, stated, beside), self._facts, robot.joint_names)
         try:
             recording = check_recording(fields, source=str(path), default_name=log.name)
         except ValueError as error:
+            self._refused.setdefault(str(path), reading)
             if left and _name_others(fields, names):
                 raise ValueError(f"{error} Columns of the log: {left[0].lower()}{left[1:]}") from None
             raise
+        self._readings.setdefault(str(path), reading)
         if len(log.name) > len(path.stem):  # an episode, or a part
             recording = replace(recording, name=log.name)
         return replace(recording, unit_stated=unit_stated, notes=(*recording.notes, *notes)), used
+
+
+def set_aside(name: str, fault: ValueError | str) -> str:
+    """The warning that a file or an episode cannot be used."""
+    return printable(f"warning: {name} is set aside (--strict refuses it): {' '.join(str(fault).split())} [W20]")
 
 
 _ENOUGH = 20
@@ -366,28 +405,6 @@ def _joints_of(path: Path, columns: ColumnMap, robot: Robot) -> tuple[str, ...]:
             "Add them, or name the joints to identify with --joints."
         )
     return names
-
-
-def _what_is_missing(path: Path, log: Log, missing: Sequence[str], columns: ColumnMap, notes: Sequence[str]) -> str:
-    """The message, and a map to correct beside it."""
-    columns = columns if columns.joints else replace(columns, joints={"JOINT": {}})
-    target = _free(Path(f"{log.name.replace(' ', '_')}_map.toml"))
-    known = [f"{key}: {len(channel.time)} values at {channel.rate:.4g} Hz" for key, channel in log.channels.items()]
-    head = (
-        f"Guessed from {path}; correct it and give it with --columns. Missing: {'; '.join(missing)}.",
-        *notes,
-        'Entries: {from = "COLUMN", unit = "deg", sign = -1, offset = 0.1, gear_ratio = 9.0, factor = 1.2}',
-        "The log holds:",
-        *known,
-    )
-    try:
-        write_map(target, columns, head)
-        where = f"What was guessed is in {target}: complete it and give it with --columns {shlex.quote(str(target))}."
-    except OSError:
-        where = "Give a column map with --columns:\n" + map_text(columns)
-    return printable(
-        f"{path}: missing {'; '.join(missing)}. The log holds {listed(log.channels, 24)}. {' '.join(notes)} {where}"
-    )
 
 
 def _free(path: Path) -> Path:

@@ -273,9 +273,12 @@ def _trajectory(message: Any, topic: str) -> Iterator[tuple[int, Names, np.ndarr
             f"{topic}: a trajectory lasts {1e-9 * (after[-1] - after[0]):.3g} s, expected at most a day. Leave its "
             "messages out of the bag."
         )
-    instants = np.append(np.arange(after[0], after[-1], _FINE), after[-1])
-    for at, values in zip(instants.tolist(), interpolate_linear(after, table, instants), strict=True):
-        yield at, tuple(names), values
+    count = int(-(-(after[-1] - after[0]) // _FINE))
+    for first in range(0, count + 1, _AT_ONCE):  # the memory is looked at in between
+        steps = np.arange(first, min(first + _AT_ONCE, count + 1))
+        instants = np.minimum(after[0] + _FINE * steps, after[-1])
+        for at, values in zip(instants.tolist(), interpolate_linear(after, table, instants), strict=True):
+            yield at, tuple(names), values
 
 
 def _numbers(value: Any, place: str) -> Iterator[tuple[str, float]]:

@@ -233,7 +233,10 @@ def _logs(
     back = _set_back(time, numbers)
     parts = [slice(a, b) for a, b in zip([0, *back], [*back, len(time)], strict=True)]
     if len(back):
-        jumps = [f"by {time[k - 1] - time[k]:.4g} s after row {k} ({time[k - 1] - time[0]:.4g} s)" for k in back]
+        known = np.isfinite(time)
+        last = time[np.maximum.accumulate(np.where(known, np.arange(len(time)), 0))]
+        first = time[known][0]
+        jumps = [f"by {last[k - 1] - time[k]:.4g} s after row {k} ({last[k - 1] - first:.4g} s)" for k in back]
         short = [rows for rows in parts if rows.stop - rows.start < MIN_SAMPLES]
         parts = [rows for rows in parts if rows not in short] or parts
         left = f" Parts of fewer than {MIN_SAMPLES} rows are left out." if 0 < len(short) <= len(back) else ""
@@ -260,7 +263,9 @@ def _logs(
 def _set_back(time: np.ndarray, columns: Mapping[str, np.ndarray]) -> list[int]:
     """Rows at which the clock was set back, where the same columns go on: not of channels one after another."""
     filled = np.array([np.isfinite(values) for values in columns.values()]).reshape(len(columns), -1)
-    return [k for k in set_back(time).tolist() if np.any(filled[:, :k].any(axis=1) & filled[:, k:].any(axis=1))]
+    stamped = np.flatnonzero(np.isfinite(time))
+    back = stamped[set_back(time[stamped])].tolist()
+    return [k for k in back if np.any(filled[:, :k].any(axis=1) & filled[:, k:].any(axis=1))]
 
 
 def _time(
@@ -292,7 +297,11 @@ def _beside(name: str, time: np.ndarray, other: str, values: np.ndarray) -> str:
     """What is to be said of a second column of time: that it runs at another rate than the one that is used."""
     if values.dtype.kind in "UM":
         return ""
-    spans = float(np.ptp(time)), float(np.ptp(seconds_of(values)[0] if unix_unit(values) else values))
+    other_time = seconds_of(values)[0] if unix_unit(values) else values
+    both = np.isfinite(time) & np.isfinite(other_time)
+    if not both.any():
+        return ""
+    spans = float(np.ptp(time[both])), float(np.ptp(other_time[both]))
     ratio = min((spans[1] * unit / spans[0] for unit in TIME_UNITS.values()), key=lambda ratio: abs(np.log(ratio)))
     if abs(ratio - 1.0) < _ONE_CLOCK:
         return ""

@@ -34,6 +34,8 @@ _CLEAR = 3.0
 """How many times nearer one unit must be than the other, to be it."""
 _WRONG = 5.0
 """Times its position's slope, or part of it, that a speed with a stated unit is not."""
+_PAUSE = 20.0
+"""Steps of the usual length that a pause is longer than: what moved in it is not known."""
 _MOVES = 0.05
 """Root mean square of a slope that a speed can be held against [rad/s]."""
 
@@ -217,7 +219,7 @@ def _of_speeds(
 def no_slopes(speeds: Mapping[str, Channel], positions: Mapping[str, Channel]) -> dict[str, float]:
     """How many times the slope of its position a speed is, of joints where that is far from 1.
 
-    The speed's integral is held against the position: an encoder's noise counts little there.
+    The speed's integral is held against the position, between pauses: an encoder's noise counts little there.
 
     Args:
         speeds: By joint, in SI units.
@@ -229,9 +231,17 @@ def no_slopes(speeds: Mapping[str, Channel], positions: Mapping[str, Channel]) -
         if position is None or len(position.time) < 3:
             continue
         there = np.interp(position.time, channel.time, channel.values)
-        moved, reached = (
-            signal.detrend(each) for each in (cumulative_trapezoid(there, position.time, initial=0.0), position.values)
-        )
+        step = np.diff(position.time)
+        ends = np.flatnonzero(step > _PAUSE * np.median(step)) + 1
+        stretches = zip(*(np.split(each, ends) for each in (position.time, there, position.values)), strict=True)
+        parts = [
+            (signal.detrend(cumulative_trapezoid(speed, time, initial=0.0)), signal.detrend(values))
+            for time, speed, values in stretches
+            if len(time) >= 3
+        ]
+        if not parts:
+            continue
+        moved, reached = (np.concatenate(each) for each in zip(*parts, strict=True))
         if np.std(reached) < _STILL:
             continue
         ratio = float(moved @ reached / (reached @ reached))

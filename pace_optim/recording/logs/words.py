@@ -95,22 +95,25 @@ _NOT_OF_DRIVES = {"ambient", "room", "air", "cpu", "gpu", "board", "mcu", "ntc",
 """Words of temperatures and voltages of other things than drives."""
 _GENERIC = {"joint", "joints", "j", "motor", "motors", "dof", "actuator", "servo", "axis", "drive", "link", "data"}
 _SIDES = {"l": "left", "r": "right"}
-PER_S = r"[ _]?(/|per)[ _]?s(ec(onds?)?)?"
+PER_S = r"(?:[ _]?(?:/|per)[ _]?s(?:ec(?:onds?)?)?|[ _.·⋅*]?s(?:\^-1|⁻¹))"
+_TURNS = "(revs?|revolutions?|turns?)"
+_BEGIN = "(?:(?<![a-z])|(?-i:(?<=[a-z])(?=[A-Z])))"
+"""Where a word begins, in upper case within a name without separators."""
 _DOT = r"[ _.·⋅*-]?"
 _UNIT_PATTERNS: tuple[tuple[str, str, str], ...] = (
     (r"°c\b|\bdeg(rees?)?[ _]?c(elsius)?\b|\bcelsius\b|[\[(]c[\])]", TEMPERATURE, "°C"),
     (r"\bmv\b|millivolts?", VOLTAGE, "mV"),
     (r"[\[(]v[\])]", VOLTAGE, "V"),
-    (rf"(?<![a-z])mdeg{PER_S}|(?<![a-z])mdeg_s\b", VELOCITY, "mdeg/s"),
-    (rf"(?<![a-z])cdeg{PER_S}|(?<![a-z])cdeg_s\b", VELOCITY, "cdeg/s"),
-    (rf"(?<![a-z])mrad{PER_S}|(?<![a-z])mrad_s\b", VELOCITY, "mrad/s"),
-    (rf"(?<![mcd])deg(rees?)?{PER_S}|(?<![mcd])deg_s\b|dps\b|(?<!m)°/s(ec)?", VELOCITY, "deg/s"),
-    (rf"(?<![mcg])rad(ians?)?{PER_S}|(?<![mcg])rad_s\b", VELOCITY, "rad/s"),
-    (r"\brpm\b", VELOCITY, "rpm"),
-    (rf"(rev|turns?){PER_S}|rps\b", VELOCITY, "turn/s"),
+    (rf"{_BEGIN}mdeg({PER_S}|_s\b)", VELOCITY, "mdeg/s"),
+    (rf"{_BEGIN}cdeg({PER_S}|_s\b)", VELOCITY, "cdeg/s"),
+    (rf"{_BEGIN}mrad({PER_S}|_s\b)", VELOCITY, "mrad/s"),
+    (rf"(?<!{_BEGIN}[mcd])deg((rees?)?{PER_S}|_s\b)|dps\b|(?<!m)°{PER_S}", VELOCITY, "deg/s"),
+    (rf"(?<!{_BEGIN}[mcg])rad((ians?)?{PER_S}|_s\b)|[\[(](1/s(ec)?|s\^-1|s⁻¹)[\])]", VELOCITY, "rad/s"),
+    (rf"\brpm\b|{_TURNS}[ _]?(/|per)[ _]?min(utes?)?\b", VELOCITY, "rpm"),
+    (rf"{_TURNS}{PER_S}|rps\b", VELOCITY, "turn/s"),
     (rf"\bmm{PER_S}\b|mm_s\b", VELOCITY, "mm/s"),
     (rf"\bcm{PER_S}\b|cm_s\b", VELOCITY, "cm/s"),
-    (rf"\bm{PER_S}\b|[ _]m_s\b", VELOCITY, "m/s"),
+    (rf"\bm{PER_S}\b|[\[( _]m_s\b", VELOCITY, "m/s"),
     (r"‰|\bper[ _]?mille?\b", EFFORT, "permille"),
     (r"%|\bpercent\b|\bpct\b", EFFORT, "%"),
     (rf"\bmn{_DOT}m\b", EFFORT, "mN m"),
@@ -150,9 +153,12 @@ _SYMBOL = (
     r"°c|°f|deg ?[cf]|[cfk]|%|‰|[mµun]?s|sec|min|h|[mk]?g|kgf|gf|ozf?|[mk]?w|[mk]?j)"
 )
 _LIKE_A_UNIT = re.compile(
-    rf"(?:\d+(?:\.\d+)?(?:e-?\d+)? ?)?{_SYMBOL}(?:[ _.·⋅*/-]{{1,2}}{_SYMBOL}|\^-?[123]|[²³]|(?<=/s)2)*"
+    rf"(?:\d+(?:\.\d+)?(?:e-?\d+)? ?)?{_SYMBOL}(?:[ _.·⋅*/-]{{1,2}}{_SYMBOL}|\^-?[123]|⁻?[¹²³]|(?<=/s)2)*"
 )
 """What stands in brackets behind a name and is a unit, known or not: no joint's name or number."""
+
+_SI_GAIN = re.compile(r"nm?s?(?:/(?:rad|m)(?:/s)?|(?:rad|m)(?:\^-1|⁻¹))?")
+"""A gain's unit that is as facts have it, without what stands between its symbols."""
 
 _SEAMS = re.compile(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])|(?<=[A-Za-z])(?=\d)|(?<=\d)(?=[A-Za-z])")
 """Where a word ends inside of a name without separators."""
@@ -213,7 +219,7 @@ def meaning(name: str, table: str = "", joint: tuple[int, int] | None = None) ->
         name = f"{whole[: joint[0]]} {whole[joint[1] :]}"
     unknown = _unknown_unit(name)
     unit, of_unit, without_unit = ("", "", _BRACKET.sub("", name)) if unknown else _unit(name)
-    name = without_unit if unknown else name
+    name = without_unit if unknown or unit == "rpm" else name  # which may be rev/min
     own, around = words(name), words(table)
     said = set(own)
     current = (
@@ -247,6 +253,10 @@ def meaning(name: str, table: str = "", joint: tuple[int, int] | None = None) ->
         commanded = True
     if of_unit == EFFORT and unit in ("%", "permille") and quantity != EFFORT:
         quantity = ""  # part of a range that nothing states
+    if quantity in GAINS.values():
+        unknown = _unknown_gain(whole)
+    elif quantity not in UNITS:
+        unknown = ""
     if quantity == "torque_enable":
         spoken = spoken | {"enable", "enabled", "on"}
     label = [word for word in words(without_unit) if word not in spoken]
@@ -267,22 +277,28 @@ def meaning(name: str, table: str = "", joint: tuple[int, int] | None = None) ->
 def joint_places(columns: Iterable[str], joint_names: Sequence[str] = ()) -> dict[str, tuple[int, int]]:
     """Where a joint's name stands in those of columns, such as ``index_q1`` in ``index_q1_pos``.
 
-    1. A name that the robot has; of several the longest.
+    1. A name that the robot has; of several the longest, and outside of brackets with a unit before inside.
     2. What a column of positions shares with one of commands: ``JOINT_pos`` and ``JOINT_cmd``. Of several the longest
-       that leaves a word for the series.
+       that leaves a word for the series. Brackets with a unit are no part of it, unless they hold joints
+       (:func:`_joints_like_units`).
     3. What other columns have where those two kinds have their joints: ``JOINT_vel``, and ``JOINT_pos`` alone.
     """
+    columns = list(columns)
     of_robot = sorted((tuple(words(name)) for name in joint_names), key=len, reverse=True)
+    in_brackets = _joints_like_units(columns)
     found: dict[str, tuple[int, int]] = {}
     splits: dict[str, list[_Split]] = {}
     nameless = False
     for column in columns:
-        placed = _placed(_BRACKET.sub("", column) if _unknown_unit(column) else column)
+        bracket = _unit_in_bracket(column)
+        placed = _placed(column[: bracket.start()] if bracket else column)
         own = tuple(word for word, _, _ in placed)
-        nameless |= set(own) <= _SERIES
         if at := next((at for name in of_robot if (at := _where(own, name))), None):
             found[column] = placed[at.start][1], placed[at.stop - 1][2]
+        elif bracket and (tuple(words(bracket[1])) in of_robot or column in in_brackets):
+            found[column] = bracket.span(1)
         else:
+            nameless |= set(own) <= _SERIES
             splits[column] = _splits(placed)
     every = [(column, split) for column, those in splits.items() for split in those]
     commanded = {split.joint for _, split in every if split.is_command}
@@ -375,24 +391,54 @@ def _of_table(said: set[str], around: set[str]) -> str:
     return POSITION if every & _NO_QUANTITY else ""
 
 
-def _unknown_unit(name: str) -> str:
-    """The unit in brackets at the end of a name, where no pattern is all of it."""
+def _unit_in_bracket(name: str) -> re.Match[str] | None:
+    """The bracket at the end of a name, where it holds a unit, known or not."""
     bracket = _BRACKET.search(name)
     if bracket is None or not _LIKE_A_UNIT.fullmatch(bracket[1].lower()):
-        return ""
+        return None
     if len(bracket[1]) == 1 and not set(words(name)) & set(_CONDITIONS):
-        return ""  # a letter may name a joint
-    text = f"[{bracket[1].lower()}]"
-    known = any(re.search(rf"^\[?(?:{pattern})\]?$", text) for pattern, _, _ in _UNIT_PATTERNS)
-    return "" if known else bracket[1]
+        return None  # a letter may name a joint
+    return bracket
+
+
+def _is_known(unit: str) -> bool:
+    """Whether a pattern is all of a unit."""
+    text = f"[{unit.lower()}]"
+    return any(re.search(rf"^\[?(?:{pattern})\]?$", text, re.IGNORECASE) for pattern, _, _ in _UNIT_PATTERNS)
+
+
+def _unknown_unit(name: str) -> str:
+    """The unit in brackets at the end of a name, where it is not known."""
+    bracket = _unit_in_bracket(name)
+    return "" if bracket is None or _is_known(bracket[1]) else bracket[1]
+
+
+def _unknown_gain(name: str) -> str:
+    """The unit in brackets at the end of a gain's name, where it is not that of the facts."""
+    bracket = _BRACKET.search(name)
+    if bracket is None or not (_unit_in_bracket(name) or re.search("deg|°", bracket[1].lower())):
+        return ""
+    return "" if _SI_GAIN.fullmatch(re.sub(r"[ _.·⋅*-]", "", bracket[1].lower())) else bracket[1]
+
+
+def _joints_like_units(columns: Iterable[str]) -> set[str]:
+    """Columns with a joint in brackets that looks like a unit: ``pos[LB]`` beside ``pos[LF]``."""
+    series: dict[str, dict[str, str]] = {}
+    for column in columns:
+        bracket = _BRACKET.search(column)
+        if bracket is None or not re.fullmatch(r"\w+", bracket[1]) or _is_known(bracket[1]):
+            continue
+        outside = column[: bracket.start()].strip()
+        if set(words(outside)) <= _SERIES | _GENERIC:
+            series.setdefault(outside, {})[bracket[1]] = column
+    return {column for by in series.values() if len(by) > 1 for column in by.values()}
 
 
 def _unit(name: str) -> tuple[str, str, str]:
     """Unit, the quantity that it is of, and the name without it."""
-    text = re.sub(r"[_.]", " ", name.lower())
-    for source in (name.lower(), text):
+    for source in (name, re.sub(r"[_.]", " ", name)):
         for pattern, quantity, unit in _UNIT_PATTERNS:
-            if found := re.search(pattern, source):
+            if found := re.search(pattern, source, re.IGNORECASE):
                 return unit, quantity, f"{name[: found.start()]} {name[found.end() :]}"
     return "", "", name
 

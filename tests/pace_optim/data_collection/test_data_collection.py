@@ -144,6 +144,11 @@ def test_noise_has_the_level_asked_for():
     assert error.std(axis=0) == pytest.approx(1e-3, rel=0.02) and np.abs(error.mean(axis=0)).max() < 3e-5
 
 
+def test_a_slides_encoder_has_a_tenth_of_the_noise():
+    encoder = Encoder(noise=1e-3, bits=None, rng=np.random.default_rng(0), radians=(1.0, 0.1))
+    assert encoder.read(np.zeros((20000, 2))).std(axis=0) == pytest.approx([1e-3, 1e-4], rel=0.02)
+
+
 def test_a_slides_encoder_has_steps_of_a_tenth():
     encoder = Encoder(noise=0.0, bits=12, rng=np.random.default_rng(0), radians=(1.0, 0.1))
     read = encoder.read(np.random.default_rng(1).random((4000, 2)))

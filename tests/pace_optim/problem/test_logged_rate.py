@@ -47,6 +47,28 @@ def test_a_command_that_is_repeated_is_none(repeat, own_clock, interval):
     assert command_interval(recording) == pytest.approx(interval, rel=1e-9)
 
 
+def test_rounded_targets_on_one_clock_have_the_clocks_interval():
+    des_time = 0.01 * np.arange(2000)
+    smooth = 0.2 * np.sin(np.outer(des_time, [0.7, 0.9, 0.8]) + [0, 1, 2])
+    rounded = np.round(smooth / 0.003) * 0.003  # each changes in less than half of the ticks
+    recording = Recording(
+        name="r", joint_names=("a", "b", "c"), time=des_time + 0.003, dof_pos=smooth, des_time=des_time,
+        des_dof_pos=rounded,
+    )  # fmt: skip
+    assert command_interval(recording) == pytest.approx(0.01)
+
+
+def test_two_topics_of_two_joints_each_have_the_interval_of_one_topic():
+    des_time = np.sort(np.concatenate([0.01 * np.arange(400), 0.01 * np.arange(400) + 0.003]))
+    first, second = 0.01 * np.floor(des_time / 0.01 + 1e-6), 0.01 * np.floor((des_time + 0.007) / 0.01 + 1e-6)
+    target = np.sin(np.stack([first, first + 1, second, second + 1], axis=1))
+    recording = Recording(
+        name="r", joint_names=tuple("abcd"), time=np.arange(400) * 0.01, dof_pos=np.zeros((400, 4)),
+        des_time=des_time, des_dof_pos=target,
+    )  # fmt: skip
+    assert command_interval(recording) == pytest.approx(0.01)
+
+
 def test_joints_whose_clocks_are_shifted_have_the_interval_of_one_joint():
     des_time = np.sort(np.concatenate([0.01 * np.arange(200), 0.01 * np.arange(200) + 0.0005]))
     first, second = 0.01 * (des_time // 0.01), 0.01 * ((des_time + 0.0095) // 0.01)

@@ -15,7 +15,7 @@ from recordings import says
 
 from pace_optim.commands import import_log
 from pace_optim.recording import load_recording, save_recording
-from pace_optim.recording.logs import LogReader, Robot, paired_files, read_map, tables, write_map
+from pace_optim.recording.logs import LogReader, Robot, paired_files, read_map, rosbag, tables, write_map
 from pace_optim.recording.logs.column_map import ColumnMap, Source
 from pace_optim.recording.logs.rosbag import rows_of
 from pace_optim.recording.logs.words import meaning
@@ -406,18 +406,51 @@ des_dof_pos = "c2"
 """
 
 
+def write_episodes(folder, *episodes):
+    """A data set of parquet files, one for each episode's columns."""
+    (folder / "set/meta").mkdir(parents=True)
+    (folder / "set/data").mkdir()
+    (folder / "set/meta/info.json").write_text(json.dumps({"fps": 250}))
+    for i, columns in enumerate(episodes):
+        count = len(next(iter(columns.values())))
+        columns |= {"timestamp": np.arange(count) / 250, "episode_index": np.full(count, i)}
+        parquet.write_table(pa.table(columns), folder / f"set/data/{i}.parquet")
+    return str(folder / "set")
+
+
+def test_bad_episodes_write_no_map_where_others_are_good_and_one_where_none_is(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    half, whole = {"hip_pos": POS[:, 0]}, {"hip_pos": POS[:, 0], "hip_cmd": HELD[:, 0]}
+    path = write_episodes(tmp_path / "good", dict(half), dict(whole), dict(half))
+    reader = LogReader([path])
+    assert len(reader.recordings(path, Robot())) == 1 and not list(tmp_path.glob("*.toml"))
+    lines = [line for line in reader.lines() if "[W20]" in line]
+    assert len(lines) == 2 and "missing commands" in lines[0] and "toml" not in lines[0]
+    path = write_episodes(tmp_path / "bad", dict(half), dict(half))
+    with pytest.raises(ValueError, match=r"What was guessed is in set_episode_0_map\.toml"):
+        LogReader([path]).recordings(path, Robot())
+    assert [each.name for each in tmp_path.glob("*.toml")] == ["set_episode_0_map.toml"]
+
+
+def test_a_log_is_described_by_an_episode_that_is_used(tmp_path):
+    path = write_episodes(
+        tmp_path,
+        {"hip_pos": POS[:5, 0], "hip_cmd": HELD[:5, 0], "left\x1b": POS[:5, 0]},
+        {"hip_pos": POS[:, 0], "hip_cmd": HELD[:, 0]},
+    )
+    reader = LogReader([path])
+    assert len(reader.recordings(path, Robot())) == 1
+    assert "400 values" in reader.lines()[1] and not any("\x1b" in line for line in reader.lines())
+
+
 def test_a_bad_episode_of_a_dataset_is_set_aside(tmp_path):
-    (tmp_path / "set/meta").mkdir(parents=True)
-    (tmp_path / "set/data").mkdir()
-    (tmp_path / "set/meta/info.json").write_text(json.dumps({"fps": 250}))
-    for i, count in enumerate((5, COUNT)):
-        columns = {"hip_pos": POS[:count, 0], "hip_cmd": HELD[:count, 0], "timestamp": np.arange(count) / 250}
-        columns["episode_index"] = np.full(count, i)
-        parquet.write_table(pa.table(columns), tmp_path / f"set/data/{i}.parquet")
+    episodes = ({"hip_pos": POS[:count, 0], "hip_cmd": HELD[:count, 0]} for count in (5, COUNT))
+    write_episodes(tmp_path, *episodes)
     reader = LogReader([str(tmp_path / "set")])
     (recording,) = reader.recordings(str(tmp_path / "set"), Robot())
     assert recording.name == "set episode 1"
-    assert "warning: set episode 0 is set aside" in reader.lines()[-1] and "[W20]" in reader.lines()[-1]
+    assert "warning: set episode 0 is set aside (--strict refuses it)" in reader.lines()[-1]
+    assert "[W20]" in reader.lines()[-1]
     with pytest.raises(ValueError, match="found 5 samples"):
         LogReader([], strict=True).recordings(str(tmp_path / "set"), Robot())
 
@@ -605,6 +638,23 @@ def test_a_parquet_file_that_unpacks_to_too_much_is_refused(tmp_path, monkeypatc
     monkeypatch.setattr("pace_actuators.memory.available_memory", lambda: 5e7)
     with pytest.raises(ValueError, match=r"long\.parquet: reading its 1e\+06 values would take 0\.064 GB of memory"):
         load_recordings(tmp_path / "long.parquet")
+
+
+def test_a_long_trajectory_is_followed_in_parts(monkeypatch):
+    spans = []
+
+    def seen(time, values, at):
+        spans.append(len(at))
+        return np.interp(at, time, values[:, 0])[:, None]
+
+    monkeypatch.setattr(rosbag, "interpolate_linear", seen)
+    ends = [SimpleNamespace(sec=second, nanosec=0) for second in (0, 86_400)]
+    points = [
+        SimpleNamespace(positions=[float(k)], velocities=[], effort=[], time_from_start=end)
+        for k, end in enumerate(ends)
+    ]
+    rows = rows_of(SimpleNamespace(joint_names=["hip"], points=points), "/plan")
+    assert next(rows)[0] == 0 and sum(spans) <= 100_000  # memory is checked between parts
 
 
 def test_a_trajectory_without_an_end_is_refused():

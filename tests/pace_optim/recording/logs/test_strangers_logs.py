@@ -315,6 +315,19 @@ def test_a_clock_that_was_set_back_is_found_and_late_rows_are_not():
     assert not len(set_back(late)) and not len(set_back(fine[::-1])) and not len(set_back(fine))
 
 
+def test_rows_without_time_hide_no_clock_that_was_set_back_and_no_second_clock(tmp_path):
+    time = np.concatenate([TIME, TIME]) + 0.0
+    time[[398, 799, 801]] = np.nan
+    columns = {"q_j": np.tile(MOTION, 2), "des_j": np.tile(TARGET, 2)}
+    assert len(understood(table(tmp_path / "log.csv", time=time, **columns), Robot())) == 2
+    for rate in (1.0, 1.1):
+        other = rate * TIME
+        other[[0, 5]] = np.nan
+        path = table(tmp_path / "two.csv", time=TIME, host_time=other, q_j=MOTION, des_j=TARGET)
+        said = any(f"spans {rate:.3g} times as long" in line for line in read(path, Robot()).lines)
+        assert said == (rate != 1.0) and ("nan" not in " ".join(read(path, Robot()).lines))
+
+
 def test_a_log_whose_clock_was_set_back_is_two_recordings(tmp_path):
     jumped = np.where(np.arange(len(TIME)) < 400, TIME, TIME - 0.3)
     first, second = understood(table(tmp_path / "log.csv", **arm(time=jumped)), ARM, None)

@@ -106,6 +106,19 @@ def test_a_log_with_an_imu_is_a_recording_of_a_base_that_moves(tmp_path):
     assert read_map(tmp_path / "again.toml") == columns
 
 
+def test_an_imu_that_a_map_gives_is_not_called_unused(tmp_path):
+    path = csv_log(tmp_path, "gyro_{} [dps]", "acc_{} [LSB]")
+    (tmp_path / "map.toml").write_text(
+        '[base]\nbase_ang_vel = {from = ["gyro_x [dps]", "gyro_y [dps]", "gyro_z [dps]"], unit = "deg/s"}\n'
+        'base_lin_acc = {from = ["acc_x [LSB]", "acc_y [LSB]", "acc_z [LSB]"], unit = "mg"}\n'
+    )
+    for columns, used in ((None, False), (read_map(tmp_path / "map.toml"), True)):
+        lines: list[str] = []
+        (recording,) = load_recordings(path, columns=columns, tell=lines.append)
+        assert (recording.base_lin_acc is not None) == used
+        assert any("like an IMU's, but not used" in line for line in lines) != used
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -120,8 +133,8 @@ def test_a_wrong_table_of_the_base_is_named(tmp_path, text, words):
         read_map(path)
 
 
-def csv_log(folder: Path) -> Path:
-    names = ["t", "hip_position", "hip_command", *(f"{kind}_{axis}" for kind in ("gyro", "acc") for axis in "xyz")]
+def csv_log(folder: Path, gyro: str = "gyro_{}", acc: str = "acc_{}") -> Path:
+    names = ["t", "hip_position", "hip_command", *(kind.format(axis) for kind in (gyro, acc) for axis in "xyz")]
     rows = np.stack([TIME, 0.3 * np.sin(9 * TIME), 0.3 * np.sin(9 * TIME + 0.1), *[TIME] * 6, TIME >= 0.25], axis=1)
     path = folder / "walk.csv"
     np.savetxt(path, rows, delimiter=",", header=",".join([*names, "left_contact"]), comments="")
