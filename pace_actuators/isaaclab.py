@@ -170,9 +170,10 @@ class PaceDCMotorActuatorCfg(ActuatorBaseCfg):  # type: ignore[misc]
 
         What the simulator cannot represent, or only with help, is warned of.
         """
-        for note in check_representable(IdentifiedDrives.load(path), ISAACLAB):
+        motor = PaceDCMotorCfg.from_result(path, joint_names_expr, **overrides)
+        for note in check_representable(IdentifiedDrives.load(path), ISAACLAB, motor.implicit):
             warnings.warn(note, stacklevel=2)
-        return cls(motor=PaceDCMotorCfg.from_result(path, joint_names_expr, **overrides))
+        return cls(motor=motor)
 
 
 def joint_parameters(motor: PaceDCMotorCfg) -> dict[str, Any]:

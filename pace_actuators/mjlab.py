@@ -77,9 +77,10 @@ class PaceDCMotorActuatorCfg(ActuatorCfg):  # type: ignore[misc]
 
         What the simulator cannot represent, or only with help, is warned of.
         """
-        for note in check_representable(IdentifiedDrives.load(path), MJLAB):
+        motor = PaceDCMotorCfg.from_result(path, joint_names_expr, **overrides)
+        for note in check_representable(IdentifiedDrives.load(path), MJLAB, motor.implicit):
             warnings.warn(note, stacklevel=2)
-        return cls(motor=PaceDCMotorCfg.from_result(path, joint_names_expr, **overrides))
+        return cls(motor=motor)
 
     def build(self, entity: Any, target_ids: list[int], target_names: list[str]) -> PaceDCMotorActuator:
         """What mjlab calls."""
