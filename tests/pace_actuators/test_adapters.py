@@ -188,6 +188,7 @@ def test_mjlab_gives_the_torque_of_the_identification(references, whole_steps, t
     plain, native = found[""], found["native"]
     assert np.abs(plain["ours"] - plain["theirs"]).max() < 1e-5 * np.abs(plain["theirs"]).max()
     assert "drive_friction_event" in str(plain["unexpanded"]) and "motor" in str(plain["refused"])
+    assert str(plain["no_bias"]) == "encoder_bias of LF_HAA is nan, expected a finite number."
     assert_plain(native["torque"], whole_steps)
     drives = IdentifiedDrives.load(whole_steps)
     for name, parameter in (("armature", "armature"), ("friction", "friction"), ("viscous", "viscous_friction")):
