@@ -140,6 +140,7 @@ def test_isaac_lab_gives_the_torque_of_the_identification(references, tmp_path):
         assert np.abs(plain[f"ours_{name}"] - theirs).max() < 1e-5 * np.abs(theirs).max()
     assert "motor" in str(plain["refused"]) and (plain["load"] == -2.0).all()
     assert "DriveFrictionMixin" in str(plain["unwritten"])  # a continuous loop's kd was nowhere
+    assert "friction_is_written" in str(plain["unwritten"])
 
 
 @pytest.mark.slow
