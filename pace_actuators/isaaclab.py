@@ -123,7 +123,8 @@ class PaceDCMotorActuator(ActuatorBase):  # type: ignore[misc]
         if motor.changes_passive and not self.friction_is_written:
             raise ValueError(
                 "The drive changes the joints' friction at every physics step (its effects, or implicit=True): "
-                f"{ISAACLAB.friction_hook}."
+                f"{ISAACLAB.friction_hook}. If your own articulation writes the friction, set friction_is_written of "
+                "this actuator to True."
             )
         result = motor.compute(control_action, joint_pos, joint_vel)
         self.computed_effort, self.applied_effort = motor.computed_effort, motor.applied_effort
@@ -170,9 +171,10 @@ class PaceDCMotorActuatorCfg(ActuatorBaseCfg):  # type: ignore[misc]
 
         What the simulator cannot represent, or only with help, is warned of.
         """
-        for note in check_representable(IdentifiedDrives.load(path), ISAACLAB):
+        motor = PaceDCMotorCfg.from_result(path, joint_names_expr, **overrides)
+        for note in check_representable(IdentifiedDrives.load(path), ISAACLAB, motor.implicit):
             warnings.warn(note, stacklevel=2)
-        return cls(motor=PaceDCMotorCfg.from_result(path, joint_names_expr, **overrides))
+        return cls(motor=motor)
 
 
 def joint_parameters(motor: PaceDCMotorCfg) -> dict[str, Any]:

@@ -32,9 +32,8 @@ from mjlab.utils.spec import create_motor_actuator, get_non_free_joints
 from pace_actuators.actions import ActuatorActions
 from pace_actuators.effects.fading_friction import solver_parameters, step_of_constraint
 from pace_actuators.identified import IdentifiedDrives
-from pace_actuators.joint_values import resolve_joint_values
 from pace_actuators.pace_dc_motor import PaceDCMotor
-from pace_actuators.pace_dc_motor_cfg import PaceDCMotorCfg
+from pace_actuators.pace_dc_motor_cfg import DriveParameters, PaceDCMotorCfg
 from pace_actuators.representable import MJLAB, check_representable, refuse_inertia
 
 _SMALLEST_FRICTION = 1e-9
@@ -77,9 +76,10 @@ class PaceDCMotorActuatorCfg(ActuatorCfg):  # type: ignore[misc]
 
         What the simulator cannot represent, or only with help, is warned of.
         """
-        for note in check_representable(IdentifiedDrives.load(path), MJLAB):
+        motor = PaceDCMotorCfg.from_result(path, joint_names_expr, **overrides)
+        for note in check_representable(IdentifiedDrives.load(path), MJLAB, motor.implicit):
             warnings.warn(note, stacklevel=2)
-        return cls(motor=PaceDCMotorCfg.from_result(path, joint_names_expr, **overrides))
+        return cls(motor=motor)
 
     def build(self, entity: Any, target_ids: list[int], target_names: list[str]) -> PaceDCMotorActuator:
         """What mjlab calls."""
@@ -138,8 +138,8 @@ class PaceDCMotorActuator(Actuator):  # type: ignore[misc]
         refuse_inertia(self.motor, MJLAB)
         self._model, self._data = model, data
         self._dofs = self.entity.indexing.joint_v_adr[self.target_ids]
-        bias = resolve_joint_values(self.cfg.motor.encoder_bias, self._target_names, field="encoder_bias")
-        self._bias = bias.to(device)
+        parameters = DriveParameters(self.cfg.motor, self._target_names, 1, torch.device(device), torch.float64)
+        self._bias = parameters.read("encoder_bias", 0.0)[0]
         timeconst = 2 * dt if self.cfg.friction_timeconst is None else self.cfg.friction_timeconst
         impedance, soft = self.cfg.friction_impedance, self.motor.joint_friction_time
         solref = torch.tensor([[timeconst, 1.0]], device=device).repeat(len(self._dofs), 1)

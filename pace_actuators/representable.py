@@ -53,19 +53,20 @@ ISAACLAB = World(
 )
 
 
-def check_representable(drives: IdentifiedDrives, world: World = HERE) -> list[str]:
+def check_representable(drives: IdentifiedDrives, world: World = HERE, implicit: bool | None = None) -> list[str]:
     """What a world cannot represent of identified drives, or only with help, in words.
 
     Args:
         drives: What was identified.
         world: Where it is to be used.
+        implicit: Whether a drive's controller runs continuously there; ``None``: as the result says.
 
     Raises:
         ValueError: If the world has no way to do what an effect needs: to change friction or read the inertia at every
             step, or MuJoCo's friction.
     """
     notes = [] if world.bodies else link_notes(drives)
-    if world.friction_hook and drives.is_continuous:
+    if world.friction_hook and (drives.is_continuous if implicit is None else implicit):
         notes.append(
             f"the drive's controller runs continuously (implicit), as friction of each step: {world.friction_hook}."
         )

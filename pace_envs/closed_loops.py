@@ -18,7 +18,9 @@ _STEPS = 40
 _LARGEST_STEP = 0.3
 """Largest change of a passive joint in a Newton step [rad or m]."""
 _CLOSED = 1e-9
-"""A loop is closed when its constraints are met within this [m or rad]."""
+"""Loops are closed when the norm of their constraints' residuals is at most this [m or rad]."""
+_NO_NEARER = 1e-6
+"""Newton's method ends where its step would lower the residual by less than this part of it."""
 _RATTLES = 0.01
 """A joint that the loops leave free leans on its stop on average, if it is nearer to it than this part of its range."""
 _FOLLOWS = 1e-6
@@ -228,17 +230,22 @@ class ClosedLoops:
         return gap <= _CLOSED and bool((np.abs(off) <= slack).all())
 
     def _newton(self, qpos: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, float]:
-        """A posture on the constraints, moving some degrees of freedom, and the remaining error."""
+        """A posture on the constraints, moving some degrees of freedom, and the norm of what remains of them.
+
+        A constraint that these cannot meet does not keep the others from being met.
+        """
         best, least = qpos, np.inf
         for _ in range(_STEPS):
             jacobian, residual = self._constraints(qpos)
-            gap = float(np.abs(residual).max(initial=0.0))
+            gap = float(np.linalg.norm(residual))
             if gap < least:
                 best, least = qpos, gap
             if gap <= _CLOSED:
                 break
             step = np.zeros(self.model.nv)
             step[free] = -np.linalg.lstsq(jacobian[:, free], residual, rcond=1e-9)[0]
+            if np.linalg.norm(jacobian @ step) <= _NO_NEARER * gap:
+                break
             qpos = self._moved(qpos, step * min(1.0, _LARGEST_STEP / max(float(np.abs(step).max()), 1e-12)))
         return best, least
 

@@ -57,7 +57,8 @@ def _task_for(identified: str | None) -> str:
     if identified is None:
         raise ValueError(f"--task is missing. Available: {', '.join(known)}, or a task of yours (module:Task).")
     fitted = IdentifiedDrives.load(identified).task
-    if task := next((task for task in known if task.startswith(fitted.removesuffix("v0"))), None):
+    base = fitted.removesuffix("-v0")
+    if task := next((task for task in known if task in (f"{base}-Velocity-v0", f"{base}-Reach-v0")), None):
         return task
     raise ValueError(
         f"{identified} is a fit of {fitted}, which has no task to train in. Available: {', '.join(known)}, or a task "

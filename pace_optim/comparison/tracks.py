@@ -37,6 +37,8 @@ class Track:
     """Simulated less measured, (K, n) [rad]."""
     train: np.ndarray
     """Whether a sample was trained on, (K,) bool."""
+    held_out: np.ndarray
+    """Whether it was kept for validation, (K,) bool. A beginning that settles is neither."""
     load: np.ndarray | None
     """Load torque, (K, n) [N m], if it could be computed."""
     enabled: np.ndarray
@@ -46,8 +48,6 @@ class Track:
     swing: np.ndarray | None = None
     """How much of its swing each joint has behind it, 0 to 1, (K, n); NaN where the ground holds it. ``None``: the base
     rests."""
-    settling: np.ndarray | None = None
-    """Samples at the beginning that are neither trained on nor validated on, (K,) bool; ``None`` without any."""
 
     @property
     def counts(self) -> np.ndarray:
@@ -56,12 +56,7 @@ class Track:
         if self.swing is not None:
             free = ~np.isnan(self.swing)
             result = free | ~free.any(axis=0)
-        return result if self.settling is None else result & ~self.settling[:, None]
-
-    @property
-    def held_out(self) -> np.ndarray:
-        """Whether a sample was kept for validation, (K,) bool."""
-        return ~self.train if self.settling is None else ~self.train & ~self.settling
+        return result & (self.train | self.held_out)[:, None]
 
     @property
     def dt(self) -> float:
@@ -136,6 +131,7 @@ def load_tracks(
         loads = load_torques(Evaluator(problem.make_env, problem.dataset, problem.space), bias)
     groups = _groups(simulated, recordings)
     before = read_trajectory(folder).recordings if data and (folder / "best_trajectory.pt").is_file() else ()
+    trained = [_trained(each, before) if data else each.train for each in simulated]
     tracks = tuple(
         Track(
             name=each.name,
@@ -143,12 +139,12 @@ def load_tracks(
             target=each.target,
             measured=each.measured,
             error=each.error,
-            train=_trained(each, before) if data else each.train,
+            train=trained[r],
+            held_out=(each.train | each.held_out) & ~trained[r],
             load=None if loads is None else loads[r],
             enabled=each.enabled,
             group=groups[r],
             swing=None if problem is None else _swing(problem, r, len(each.time)),
-            settling=~each.train & ~each.held_out,
         )
         for r, each in enumerate(simulated)
     )

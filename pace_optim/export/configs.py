@@ -40,20 +40,20 @@ def drive_groups(drives: IdentifiedDrives) -> dict[str, PaceDCMotorCfg]:
 
 def cfg_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
     """``PaceDCMotorCfg``s for the environments of this project."""
-    return _page(drives, HERE, _CFG, {})
+    return _page(drives, drive_groups(drives), HERE, _CFG, {})
 
 
 def mjlab_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
     """An articulation of mjlab."""
-    template = _MJLAB
-    if _changes_friction(drives):
+    template, groups = _MJLAB, drive_groups(drives)
+    if _changes_friction(drives, groups):
         template = template.replace(_MJLAB_IMPORT, f"{_MJLAB_IMPORT}, drive_friction_event") + _MJLAB_EVENTS
-    return _page(drives, MJLAB, template, {})
+    return _page(drives, groups, MJLAB, template, {})
 
 
 def isaaclab_python(drives: IdentifiedDrives) -> tuple[str, list[str]]:
     """Actuators of an Isaac Lab articulation."""
-    return _page(drives, ISAACLAB, _ISAACLAB, {"physics_dt": Word("PHYSICS_DT")})
+    return _page(drives, drive_groups(drives), ISAACLAB, _ISAACLAB, {"physics_dt": Word("PHYSICS_DT")})
 
 
 _CFG = '''\
@@ -98,10 +98,17 @@ ACTUATORS = {name: PaceDCMotorActuatorCfg(motor=motor) for name, motor in MOTORS
 '''
 
 
-def _page(drives: IdentifiedDrives, world: World, template: str, extra: Mapping[str, Any]) -> tuple[str, list[str]]:
-    notes = [_DELAY.format(dt=1e3 * drives.at.physics_dt), *check_representable(drives, world)]
+def _page(
+    drives: IdentifiedDrives,
+    groups: Mapping[str, PaceDCMotorCfg],
+    world: World,
+    template: str,
+    extra: Mapping[str, Any],
+) -> tuple[str, list[str]]:
+    notes = check_representable(drives, world, _is_continuous(groups))
+    notes = [_DELAY.format(dt=1e3 * drives.at.physics_dt), *notes]
     notes += [*(link_notes(drives) if world is HERE else []), *extra_notes(drives)]
-    motors = {group: _call(cfg, extra) for group, cfg in drive_groups(drives).items()}
+    motors = {group: _call(cfg, extra) for group, cfg in groups.items()}
     values = {"_ABOUT_": about(drives, "", notes), "_MOTORS_": motors, "_PHYSICS_DT_": drives.at.physics_dt}
     return python_page(template, values), notes
 
@@ -127,10 +134,15 @@ def extra_notes(drives: IdentifiedDrives) -> list[str]:
     ]
 
 
-def _changes_friction(drives: IdentifiedDrives) -> bool:
+def _changes_friction(drives: IdentifiedDrives, groups: Mapping[str, PaceDCMotorCfg]) -> bool:
     kinds = [effect.effect_class for effect in drives.effects]
     stages = ("feedback", "friction", "transmission")
-    return drives.is_continuous or any(kind.overrides(stage) for kind in kinds for stage in stages)
+    return _is_continuous(groups) or any(kind.overrides(stage) for kind in kinds for stage in stages)
+
+
+def _is_continuous(groups: Mapping[str, PaceDCMotorCfg]) -> bool:
+    """Whether a drive's controller runs continuously, by the result or by the robot's configuration."""
+    return any(cfg.implicit for cfg in groups.values())
 
 
 def _call(cfg: PaceDCMotorCfg, extra: Mapping[str, Any]) -> Call:

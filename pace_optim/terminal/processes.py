@@ -15,7 +15,9 @@ import torch.distributed as dist
 from pace_envs.lost_process import told_of_lost_processes
 
 _LOST_AFTER = timedelta(minutes=10)
+"""How long a process may be silent before it counts as lost."""
 _LEISURE = timedelta(days=30)
+"""How long the others wait for the one that writes."""
 _at_leisure: dist.ProcessGroup | None = None
 """The same processes, for waiting until the one that writes needs the others."""
 

@@ -140,6 +140,7 @@ def test_isaac_lab_gives_the_torque_of_the_identification(references, tmp_path):
         assert np.abs(plain[f"ours_{name}"] - theirs).max() < 1e-5 * np.abs(theirs).max()
     assert "motor" in str(plain["refused"]) and (plain["load"] == -2.0).all()
     assert "DriveFrictionMixin" in str(plain["unwritten"])  # a continuous loop's kd was nowhere
+    assert "friction_is_written" in str(plain["unwritten"])
 
 
 @pytest.mark.slow
@@ -188,6 +189,7 @@ def test_mjlab_gives_the_torque_of_the_identification(references, whole_steps, t
     plain, native = found[""], found["native"]
     assert np.abs(plain["ours"] - plain["theirs"]).max() < 1e-5 * np.abs(plain["theirs"]).max()
     assert "drive_friction_event" in str(plain["unexpanded"]) and "motor" in str(plain["refused"])
+    assert str(plain["no_bias"]) == "encoder_bias of LF_HAA is nan, expected a finite number."
     assert_plain(native["torque"], whole_steps)
     drives = IdentifiedDrives.load(whole_steps)
     for name, parameter in (("armature", "armature"), ("friction", "friction"), ("viscous", "viscous_friction")):

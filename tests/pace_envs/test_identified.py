@@ -22,7 +22,9 @@ from pace_actuators.identified import draw, labels_with_std
 from pace_actuators.representable import HERE, ISAACLAB, MJLAB, World, check_representable, refuse_inertia
 from pace_envs import ManagerBasedRLEnv, TerrainCfg, load_env_cfg, set_physics_dt
 from pace_envs.identified import doubts, set_identified_step, set_step, step_note, use_identified
+from pace_envs.registration import registered_tasks
 from pace_envs.rl import RunSettings, load_cfg, train
+from pace_optim.commands import train as commands_train
 from pace_optim.commands.train import _task_for
 from pace_optim.identification.fit import fit
 from pace_optim.recording import save_recording
@@ -396,6 +398,14 @@ def test_a_finer_step_keeps_the_controllers_rate_with_effects_too(result):
     assert (stiff.sim.integrator, stiff.scene.robot.actuators["legs"].control_decimation) == ("leapfrog", 5)
     coarse = load_cfg(RunSettings(task=WALK, identified=str(result), physics_dt=0.005))
     assert (coarse.sim.dt, coarse.decimation) == (0.005, 4)
+
+
+def test_the_task_to_train_in_is_of_that_robot_and_of_no_other_with_a_longer_name(result, monkeypatch):
+    content = json.loads(result.read_text())
+    result.write_text(json.dumps(content | {"task": "Pace-Go2-v0"}))
+    own = registered_tasks()
+    monkeypatch.setattr(commands_train, "registered_tasks", lambda: ["Pace-Go2-Heavy-Velocity-v0", *own])
+    assert _task_for(str(result)) == "Pace-Go2-Velocity-v0"
 
 
 def test_the_task_to_train_in_is_that_of_the_fit_s_robot_or_what_there_is_is_told(result):

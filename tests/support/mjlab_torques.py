@@ -7,6 +7,7 @@ The result's drive, the configuration that ``export --format mjlab`` writes, and
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from pathlib import Path
 
@@ -148,6 +149,11 @@ def main(robot: str, output: str, result: str, configuration: str, native_page: 
         out["refused"] = ""
     except ValueError as error:
         out["refused"] = str(error)
+    try:
+        World(robot, PaceDCMotorActuatorCfg(motor=dataclasses.replace(ours, encoder_bias=float("nan"))))
+        out["no_bias"] = ""
+    except ValueError as error:
+        out["no_bias"] = str(error)
     np.savez(output, **out)
 
 

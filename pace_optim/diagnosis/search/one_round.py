@@ -22,6 +22,8 @@ from pace_optim.joints.fits.fitted import Fitted
 
 _EFFECTS = 3
 """Names that a line of progress shows."""
+_LEAST = 1e-3
+"""Each floor counts as at least this part of the largest: that of a simulated recording can be zero."""
 
 
 def try_effects(search: Search, branch: Branch, rough: bool = False) -> Round | None:
@@ -177,7 +179,7 @@ def _short_list(
         floor: RMSE of each joint below which there is nothing to find, (n,).
         cfg: How many are wanted.
     """
-    weight = floor.square().clamp(min=1e-300).reciprocal()
+    weight = (floor / floor.max()).nan_to_num(nan=1.0).clamp(min=_LEAST).square().reciprocal()
     total = {effect: float((values * weight)[excess > 0].sum()) for effect, values in explained.items()}
     wanted = sorted((e for e in total if total[e] > 0), key=lambda e: -total[e])[: cfg.of_robot]
     for j in (excess * weight).argsort(descending=True)[: cfg.of_joint].tolist():

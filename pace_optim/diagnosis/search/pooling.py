@@ -35,7 +35,8 @@ def pool(fits: Fits, outcome: Outcome, floor: torch.Tensor, log: Log = unlogged)
         fitted = fits.side_by_side(outcome.problem, [held], fits.cfg.again, keep_jacobian=True)[0]
         errors = fits.validation_errors(outcome.problem, [fitted])[0]
         joints = has.nonzero()[:, 0].tolist()
-        if decide("pool", joints, outcome.final_errors, {effect.name: errors}, cfg=outcome.cfg, log=log):
+        after, least = {effect.name: errors}, floor[joints].tolist()
+        if decide("pool", joints, outcome.final_errors, after, cfg=outcome.cfg, log=log, floor=least):
             outcome = replace(_pooled(outcome, fitted, effect), final_errors=errors)
     return outcome
 

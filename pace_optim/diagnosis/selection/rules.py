@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import torch
+
 from pace_actuators.effects import get_effect
 from pace_optim.diagnosis.diagnosis_cfg import DEFAULT, DiagnosisCfg, JudgingCfg
 from pace_optim.diagnosis.selection.candidate_results import Trial
@@ -75,9 +77,14 @@ def _replace(decision: Decision, cfg: DiagnosisCfg) -> Taken:
 
 
 def _pool(decision: Decision, cfg: DiagnosisCfg) -> Taken:
-    """One value for all joints, where their squared errors rise by as much as is alike, in their mean."""
+    """One value for all joints, if their squared errors rise by no more than what is alike, in their mean.
+
+    An error below its joint's floor counts as that floor.
+    """
     ((name, after),) = decision.after.items()
-    taken = within(float((after.mse / decision.before.mse).nan_to_num(nan=1.0).mean()), 1.0, cfg.judging.alike)
+    least = torch.tensor(decision.facts.get("floor", 0.0), dtype=torch.float64).square()
+    rises = torch.maximum(after.mse, least) / torch.maximum(decision.before.mse, least)
+    taken = within(float(rises.nan_to_num(nan=1.0).mean()), 1.0, cfg.judging.alike)
     return [name if taken else None for _ in decision.joints]
 
 

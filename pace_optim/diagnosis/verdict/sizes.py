@@ -70,7 +70,7 @@ def size_of(
     return {
         "parameter": parameter.name,
         "value": value,
-        "std": std or None,
+        "std": std if std is not None and std > 0 else None,
         "unit": units_for(parameter.unit, [joint_type]),
         "factor": factor_of(effect, parameter, value),
         "at_bound": at_bound,

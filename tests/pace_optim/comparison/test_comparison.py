@@ -54,6 +54,7 @@ def track(error, position=CHIRP, *, noise=1e-4, name="chirp", group=0, load=None
         measured=(position + own)[:, None],
         error=(error - own)[:, None],
         train=np.full(len(position), train),
+        held_out=np.full(len(position), not train),
         load=None if load is None else load[:, None],
         group=group,
         enabled=np.ones(len(position), dtype=bool),
@@ -62,9 +63,9 @@ def track(error, position=CHIRP, *, noise=1e-4, name="chirp", group=0, load=None
 
 def test_a_beginning_that_is_not_judged_by_the_fit_is_not_compared_either():
     one = track(np.where(TIME[: len(CHIRP)] < 1.0, 0.1, 0.0), train=False, noise=0.0)
-    settled = replace(one, settling=one.time < 1.0)
+    settled = replace(one, held_out=one.time >= 1.0)
     assert rmse_by_part([one])["validation"] > 0.01 and rmse_by_part([settled])["validation"] == 0.0
-    assert not settled.held_out[0] and settled.held_out[-1]
+    assert not settled.counts[0, 0] and settled.counts[-1, 0]
 
 
 def reversal_error(position=CHIRP, lasting=0.05):

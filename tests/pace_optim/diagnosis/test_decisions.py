@@ -87,6 +87,15 @@ def test_another_comparison_decides_otherwise():
     assert decide("add", [0], errors, after, cfg=lenient, log=lambda _: None, **facts) == {0: "stribeck_friction"}
 
 
+def test_a_rise_far_below_the_floor_does_not_refuse_one_value():
+    """A joint at 1e-9 rad rose to 1e-8 rad, both without meaning, and all joints kept separate values."""
+    given = {"joints": [0, 1], "before": errors_of(1e-3, 1e-9), "cfg": DEFAULT, "log": lambda _: None}
+    small, large = ({"torque_gain": errors_of(1e-3, rmse)} for rmse in (1e-8, 1e-4))
+    assert decide("pool", after=small, **given) == {}  # as recorded without a floor
+    assert decide("pool", after=small, floor=[1e-5, 1e-5], **given) == {0: "torque_gain", 1: "torque_gain"}
+    assert decide("pool", after=large, floor=[1e-5, 1e-5], **given) == {}
+
+
 def test_every_rule_can_be_switched_off_and_no_other():
     assert not DiagnosisCfg(off=("pool",)).has("pool") and DiagnosisCfg().has("pool")
     with pytest.raises(ValueError, match=r"no rule 'pol'.*pool"):

@@ -71,6 +71,25 @@ def test_limits_stay_where_one_joint_has_none(result):
     assert found[first] == math.inf and found[second] == 89.0
 
 
+def test_a_continuous_loop_of_the_robots_configuration_gets_its_event(result, monkeypatch):
+    """Of a result without facts of the drive: the page had implicit=True, and neither the event nor the note."""
+    content = json.loads(result.read_text())
+    content["drive"], content["effects"] = {}, []
+    result.write_text(json.dumps(content))
+
+    def continuous(drives):
+        cfg = load_env_cfg("Pace-AnymalD-v0")
+        for drive in cfg.scene.robot.actuators.values():
+            drive.implicit, drive.drive_dt = True, None
+        return cfg
+
+    for known in (False, True):
+        text = export(result, "mjlab").text
+        found = [word in text for word in ("implicit=True", "EVENTS", "runs continuously")]
+        assert found == [known] * 3
+        monkeypatch.setattr("pace_optim.export.configs.load_identified_cfg", continuous)
+
+
 def test_a_result_is_used_where_some_joints_have_no_torque_speed_line(result):
     """A stall torque of inf, which stands for no line, was refused in training and in the exported page."""
     whole, content = torques(PaceDCMotorCfg.from_result(result)), json.loads(result.read_text())

@@ -247,6 +247,14 @@ def test_the_worst_joint_is_the_one_furthest_above_its_floor():
     assert _short_list(explained, excess, floor, cfg) == [STRIBECK]
 
 
+@pytest.mark.parametrize(("floor", "chosen"), [((1e-3, 0.0), GAIN), ((0.0, 0.0), GAIN), ((1e-3, 1e-3), GAIN)])
+def test_a_joint_whose_floor_is_zero_does_not_decide_alone(floor, chosen):
+    """A simulated recording without noise has such a floor: a nanoradian of that joint outweighed all others."""
+    cfg = replace(DEFAULT.candidates, of_robot=1, of_joint=1)
+    explained = {GAIN: torch.tensor([1e-4, 0.0]), STRIBECK: torch.tensor([0.0, 1e-18])}
+    assert _short_list(explained, torch.tensor([1e-4, 1e-18]), torch.tensor(floor), cfg) == [chosen]
+
+
 def test_a_rival_that_is_chosen_makes_the_one_before_its_rival_and_is_none_of_its_own():
     this = Round(trials=[[], [], []], chosen=[GAIN, GAIN, None], rivals=[[STRIBECK, QUADRATIC], [STRIBECK], []])
     other = this.choosing([STRIBECK, QUADRATIC, GAIN])

@@ -18,7 +18,7 @@ from pace_optim.diagnosis import Diagnosis
 from pace_optim.diagnosis.findings.text import lines_of, size_lines
 from pace_optim.diagnosis.search.state import Outcome
 from pace_optim.diagnosis.verdict.names import hint
-from pace_optim.diagnosis.verdict.sizes import factor_of, sizes
+from pace_optim.diagnosis.verdict.sizes import factor_of, size_of, sizes
 from pace_optim.diagnosis.verdict.verdict import likes
 from pace_optim.estimate.error_bars.uncertainty import sandwich
 from pace_optim.joints.fits.fitted import Fitted
@@ -66,6 +66,11 @@ def test_a_size_is_told_with_its_error_bar_and_as_a_factor_where_it_is_one(chang
 def test_a_share_is_told_as_a_person_reads_it(share, text):
     """It said 7e-05 %, and 100 % where joints were left at three floors."""
     assert percent(share) == text
+
+
+@pytest.mark.parametrize(("std", "told"), [(0.01, 0.01), (0.0, None), (None, None), (float("nan"), None)])
+def test_an_error_bar_that_is_no_number_is_left_out(std, told):
+    assert size_of(GAIN, GAIN.parameters[0], 0.9, std, "hinge")["std"] == told
 
 
 def test_what_multiplies_what_was_stated_is_a_factor():

@@ -8,6 +8,7 @@ from browser import CHROMIUM, Browser
 
 from pace_actuators import PaceDCMotor, PaceDCMotorCfg
 from pace_actuators.files import write_tensors
+from pace_envs.closed_loops import ClosedLoops
 from pace_envs.model_file import read_model_file
 from pace_optim.commands.replay import main
 from pace_optim.report import write_report
@@ -163,6 +164,41 @@ def test_joints_of_a_closed_chain_that_no_encoder_measures_follow():
         data.qpos[:] = qpos
         mujoco.mj_fwdPosition(model, data)
         assert np.abs(data.efc_pos[: data.ne]).max() < 1e-6
+    assert np.ptp(motion.simulated[:, 2]) > 0.1
+
+
+FINGERS = "".join(
+    f'<body name="{side}" pos="0 {y} 0"><joint name="{side}" type="slide" axis="0 1 0"/><geom size=".01"/></body>'
+    for side, y in (("left", 0.2), ("right", -0.2))
+)
+SECOND = FOUR_BAR.partition("<worldbody>")[2].partition("</worldbody>")[0]
+for part in ("crank", "rod", "rocker"):
+    SECOND = SECOND.replace(f'"{part}"', f'"{part}2"')
+
+
+@pytest.mark.parametrize(
+    ("bodies", "equality", "encoders"),
+    [
+        (FINGERS, '<joint joint1="left" joint2="right"/>', ["left", "right"]),
+        (SECOND, '<connect body1="rod2" body2="rocker2" anchor=".3 0 0"/>', ["crank2", "rocker2"]),
+    ],
+    ids=["two measured joints", "two encoders of one freedom"],
+)
+def test_a_constraint_that_encoders_contradict_leaves_other_loops_closed(bodies, equality, encoders, monkeypatch):
+    """No step lowered the largest gap: the passive joints of all loops stood still."""
+    looked, constraints = [], ClosedLoops._constraints
+    monkeypatch.setattr(ClosedLoops, "_constraints", lambda *args: looked.append(0) or constraints(*args))
+    text = FOUR_BAR.replace("</worldbody>", f"{bodies}</worldbody>").replace("</equality>", f"{equality}</equality>")
+    model = mujoco.MjModel.from_xml_string(text)
+    (motion,) = motions_of(model, ["crank", *encoders], [recording(3)], [0.0, 0.0, 0.0])
+    postures = len(motion.measured) + len(motion.simulated)
+    assert len(looked) < 20 * postures
+    data = mujoco.MjData(model)
+    for qpos in motion.simulated[:: len(motion.time) // 7]:
+        data.qpos[:] = qpos
+        mujoco.mj_fwdPosition(model, data)
+        gaps = np.abs(data.efc_pos[: data.ne])[data.efc_id[: data.ne] == 0]
+        assert len(gaps) == 3 and gaps.max() < 1e-6
     assert np.ptp(motion.simulated[:, 2]) > 0.1
 
 
