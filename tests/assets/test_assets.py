@@ -192,6 +192,7 @@ def test_foot_sites_sit_in_the_foot_spheres(robot):
         np.testing.assert_allclose(site.pos, geom.pos)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", LEGS)
 def test_robot_stands_on_its_feet_without_creeping(robot):
     posture, height, (stiffness, damping, armature, effort_limit) = STANDING[robot]

@@ -44,6 +44,7 @@ def test_fixed_entries_cost_no_simulation_and_keep_no_column(case):
     assert all(case.problem.colouring.joints[entry] == () for entry in range(space.size) if entry not in coloured)
 
 
+@pytest.mark.slow
 def test_the_chirp_drives_the_drives_into_the_effort_limit_which_both_sides_have():
     begun = drive_problem.drive_problem(steps=1600)
     (drive,) = begun.problem.env_cfg.scene.robot.actuators.values()

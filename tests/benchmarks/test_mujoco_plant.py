@@ -66,6 +66,7 @@ def test_a_drive_with_an_effect_moves_as_the_bodies_do(effect, tmp_path, monkeyp
     assert with_it < 0.1 * without
 
 
+@pytest.mark.slow
 def test_friction_of_mujocos_default_creeps(tmp_path):
     command = np.full(400, 0.3)
     base = {**BASE, "friction": 1.0}

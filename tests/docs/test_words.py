@@ -145,6 +145,7 @@ def modules() -> dict[Path, str]:
     return {path: path.read_text("utf-8") for name in PACKAGES for path in sorted((ROOT / name).rglob("*.py"))}
 
 
+@pytest.mark.slow
 def test_messages_have_none_of_the_habits():
     words = re.compile(r"\"[^\"\n]*(?:" + "|".join(HABITS) + ")", re.IGNORECASE)
     found = [

@@ -46,6 +46,7 @@ def planted(path: Path, mark: Path, kind: str) -> None:
         path.write_bytes(pickle.dumps(Planted(mark)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["torch", "pickle"])
 @pytest.mark.parametrize(
     "name",

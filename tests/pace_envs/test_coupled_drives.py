@@ -151,6 +151,7 @@ def test_compiled_drives_move_as_stepped_ones(wrist):
     assert torch.allclose(compiled, torch.stack(stepped)[steps], atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_motor_alone_along_the_motion_of_the_other_moves_as_on_the_robot(wrist):
     problem = wrist.problem
     path = reference_path(problem, wrist.truth)
@@ -165,6 +166,7 @@ def test_a_motor_alone_along_the_motion_of_the_other_moves_as_on_the_robot(wrist
     assert torch.allclose(part[..., 0], alone[..., 1], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_recording_of_joints_is_one_of_their_motors(wrist, tmp_path):
     problem = problem_of(tmp_path, WRIST, WRIST.joints, np.linalg.inv(rows_of(WRIST)))
     assert problem.joint_names == tuple(WRIST.rows)
@@ -173,6 +175,7 @@ def test_a_recording_of_joints_is_one_of_their_motors(wrist, tmp_path):
     assert "turned into their motors motor_a, motor_b" in " ".join(problem.dataset.recordings[0].notes)
 
 
+@pytest.mark.slow
 def test_a_log_states_the_motors_that_the_model_file_lacks(wrist, tmp_path):
     """Of joints' columns; a run finds them again. A belt beside a joint's own drive has a row for that too."""
     for case in (WRIST, coupled_drives.CASES[2]):
@@ -239,6 +242,7 @@ FINGERS = """<mujoco><compiler angle="radian"/><option timestep="0.0005" integra
 <actuator><position tendon="split" kp="4" kv=".1"/></actuator></mujoco>"""
 
 
+@pytest.mark.slow
 def test_a_gripper_s_tendon_pulls_both_fingers(tmp_path):
     """As MuJoCo's own servo does at fine steps; the first finger alone would bend the soft constraint between them."""
     path = tmp_path / "hand.xml"

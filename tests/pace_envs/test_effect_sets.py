@@ -28,6 +28,7 @@ def test_what_takes_from_friction_never_drives_a_motor_behind_a_spring():
     assert blown_up(BENCH, rows, 1.0, seed=0, largest=1e3) == []
 
 
+@pytest.mark.slow
 def test_elasticity_beside_backlash_is_a_spring_in_series():
     """Two couplings that each took the other's torque for the motor's brought energy in."""
     gap, side = 0.02, 1.0

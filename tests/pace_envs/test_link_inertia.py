@@ -183,6 +183,7 @@ def test_a_load_with_a_lever_is_a_body_there(tmp_path):
     assert sorted(own.body("tool").inertia) == pytest.approx(sorted(model.body("tool").inertia), abs=1e-12)
 
 
+@pytest.mark.slow
 def test_candidates_have_links_of_their_own_and_the_compiled_kernel_agrees_with_python(tmp_path, monkeypatch):
     problem = make_problem(recorded(tmp_path, {}), cfg=arm_cfg(tmp_path, ["fore@mass,com"]))
     base = problem.space.to_physical(problem.space.start)
@@ -212,6 +213,7 @@ def test_a_wrong_mass_and_centre_are_found(tmp_path):
     assert std["link_com_y"]["fore"] == pytest.approx(0.25 * (link.bounds("link_com_y")[1] - 0.01), rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_tool_s_mass_and_place_are_found(tmp_path):
     """Five times as heavy as the link that it is on, and off its centre."""
     tool = Load(added_mass={"tool": 0.5}, added_mass_at={"tool": (0.03, 0.0, -0.08)})
@@ -228,6 +230,7 @@ def test_a_tool_s_mass_and_place_are_found(tmp_path):
     assert whole.mass == pytest.approx(0.6, rel=0.01) and whole.com[2] == pytest.approx(-0.08 * 0.5 / 0.6, rel=0.02)
 
 
+@pytest.mark.slow
 def test_links_that_a_problem_holds_act_on_joints_alone_too(tmp_path):
     link = reference("fore").inertia({"link_mass": 1.6})
     problem = make_problem(recorded(tmp_path, {"fore": link}), cfg=arm_cfg(tmp_path))
@@ -325,6 +328,7 @@ def test_a_wrong_link_is_said_in_words():
     assert (wrong.label, wrong.sentence) == ("fore@mass", said)
 
 
+@pytest.mark.slow
 def test_a_fit_of_a_tool_begins_near_it(tmp_path):
     """Armatures and frictions took up the tool, and a fit ended in their valley, at 500 times the noise."""
     tool = Load(added_mass={"tool": 0.5}, added_mass_at={"tool": (0.03, 0.0, -0.08)})
@@ -337,6 +341,7 @@ def test_a_fit_of_a_tool_begins_near_it(tmp_path):
     assert start["friction"]["shoulder"] == pytest.approx(0.1, rel=0.5)
 
 
+@pytest.mark.slow
 def test_a_known_load_stays_where_a_fit_of_its_link_begins(tmp_path):
     true = {"fore": reference("fore").inertia({"link_mass": 0.92})}
     known = Load(added_mass={"fore": 0.6}, added_mass_at={"fore": (0.0, 0.0, -0.25)})
@@ -347,6 +352,7 @@ def test_a_known_load_stays_where_a_fit_of_its_link_begins(tmp_path):
     assert start["friction"]["elbow"] == pytest.approx(0.1, rel=0.5)
 
 
+@pytest.mark.slow
 def test_a_fit_of_two_wrong_links_begins_near_them(tmp_path):
     true = {
         "upper": reference("upper").inertia({"link_mass": 1.8}),

@@ -49,6 +49,7 @@ def test_a_file_that_has_changed_is_read_again_and_one_that_names_others_always(
     assert masses == pytest.approx([1, 2, 3, 4])
 
 
+@pytest.mark.slow
 def test_only_the_last_robots_are_kept(tmp_path):
     path = tmp_path / "arm.xml"
     for mass in range(1, 12):

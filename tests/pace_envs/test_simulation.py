@@ -54,6 +54,7 @@ def roll(env, duration: float, target=0.0) -> torch.Tensor:
 # ---- closed forms on the test bench: a point mass of 1 kg at 0.2 m
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("armature", [0.0, 0.02, 0.1])
 def test_armature_slows_the_pendulum(armature):
     env = bench(armature=armature)
@@ -206,6 +207,7 @@ def chains_pushed(steps):
     return sim.qvel.clone()
 
 
+@pytest.mark.slow
 def test_friction_of_joints_that_push_each_other_turns_within_a_step():
     """At the end of a step, the speeds would be 8 % off; by what each joint feels in the model's posture, 5 %."""
     exact = chains_pushed(200)

@@ -130,6 +130,7 @@ def test_an_exported_page_runs_nothing_of_a_name(fmt, carrier, tmp_path, monkeyp
         check_page(export(CARRIERS[carrier](tmp_path / str(number), bad), fmt).text, monkeypatch)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fmt", ("cfg", "mjlab"))
 def test_an_exported_page_runs_nothing_of_an_effect_s_joints(fmt, tmp_path, monkeypatch):
     for number, bad in enumerate(PAYLOADS):
@@ -140,6 +141,7 @@ def test_an_exported_page_runs_nothing_of_an_effect_s_joints(fmt, tmp_path, monk
         check_page(export(run, fmt).text, monkeypatch)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("form", "carrier"),
     [

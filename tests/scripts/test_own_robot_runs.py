@@ -198,6 +198,7 @@ def test_code_that_has_changed_is_not_imported_until_it_is_named(script, project
         assert run_script("export", run, *words).returncode == 0 and (tmp_path / "executed").exists()
 
 
+@pytest.mark.slow
 def test_a_moved_robot_is_resumed_where_it_is_now(project, tmp_path):
     folder, run = copy_of(project, tmp_path)
     moved = tmp_path / "moved"
@@ -210,11 +211,13 @@ def test_a_moved_robot_is_resumed_where_it_is_now(project, tmp_path):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_resume_says_what_it_ignores(project, elsewhere):
     done = run_script("fit", "--resume", project[1], "--seed", "0", "--sigma", "0.1")
     assert "ignored: --seed, --sigma" in done.stderr and done.returncode == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["result.json", "settings.json"])
 def test_an_effect_that_only_a_file_names_is_not_imported(name, project, tmp_path, monkeypatch):
     _, run = copy_of(project, tmp_path)

@@ -68,6 +68,7 @@ def test_a_filter_of_commands_follows_them_exactly():
     assert steps == pytest.approx([10.0 * (1 - math.exp(-k * DT / 0.02)) for k in (1, 2, 3)])
 
 
+@pytest.mark.slow
 def test_a_torque_constant_falls_with_the_heat_of_the_session():
     drive = Drive(["torque_fade"], {"torque_fade.effort": 40.0, "torque_fade.time_constant": 2.0})
     drive.motor.remember(lambda time_constant, rows: torch.full_like(time_constant, 160.0))

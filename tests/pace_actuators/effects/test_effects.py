@@ -159,6 +159,7 @@ def test_friction_drifts_over_the_session():
     assert float(drive.motor.joint_friction) == pytest.approx(0.5 * factor, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_bristle_is_a_spring_that_gives_way_at_the_friction_level():
     stiffness, level = 400.0, 0.5
     drive = Drive(["presliding_friction"], {"presliding_friction.stiffness": stiffness}, stiffness=0.0, damping=0.0)
@@ -432,6 +433,7 @@ def test_rows_begin_anew_at_first_and_after_a_reset_and_say_so_once():
     assert effect.take_new_rows() is None
 
 
+@pytest.mark.slow
 def test_a_step_with_every_effect_is_a_function_of_its_state():
     cfgs = [EffectCfg(effect=name, values={p.name: p.start for p in get_effect(name).parameters}) for name in EFFECTS]
     delays = {"delay": 1.3, "max_delay": 4.0, "control_decimation": 2}

@@ -86,6 +86,7 @@ def test_effects_move_a_joint_as_in_the_environment(bench, physics_dt, first):
 READ_THE_LINK = [name for name in EFFECTS if get_effect(name).reads_link and not get_effect(name).free_form]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", READ_THE_LINK)
 def test_an_effect_that_reads_the_link_is_left_to_the_environment(bench, name):
     expected, got, compiled = both(*with_effects(bench, [name]))
@@ -112,12 +113,14 @@ def test_a_robot_of_several_joints_that_move_each_other():
     assert positions.shape[1:] == speeds.shape[1:] == shown.shape[1:]
 
 
+@pytest.mark.slow
 def test_frictions_of_joints_that_push_each_other_settle_as_in_the_environment():
     cfg = env_cfg(ANYMAL)
     problem = make_problem(record(legs_chirp(cfg, 0.3), TRUTH, cfg=cfg), cfg=cfg).with_physics_dt(DT / 2)
     assert apart(problem, problem.space.from_dict({**TRUTH, "friction": 3.0})) < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", [".*", ".*KFE"], ids=["all", "beside hard ones"])
 def test_soft_friction_is_the_environment_s(where):
     cfg = env_cfg(ANYMAL)
@@ -129,6 +132,7 @@ def test_soft_friction_is_the_environment_s(where):
     assert float((hard - soft.evaluator().residuals(values[None]).error).abs().max()) > 1e-4
 
 
+@pytest.mark.slow
 def test_drives_in_several_groups_whose_joints_are_not_in_the_model_s_order():
     cfg = env_cfg(ANYMAL)
     robot = cfg.scene.robot
@@ -141,6 +145,7 @@ def test_drives_in_several_groups_whose_joints_are_not_in_the_model_s_order():
     assert apart(mixed, values) < 1e-8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay_mode", ["command", "effort"])
 @pytest.mark.parametrize("rate", [{}, {"drive_dt": DT / 4}, {"implicit": True}], ids=str)
 def test_delays_of_every_kind(delay_mode, rate):
@@ -184,6 +189,7 @@ class OwnDrive(PaceDCMotor):
         return super().drive_effort(effort_command, self.seen[0], joint_vel)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_compiled_is_stepped_by_the_environment(bench, monkeypatch):
     monkeypatch.setitem(registry._EFFECTS, Branching.name, Branching)
     expected, got, compiled = both(*with_effects(bench, ["branching"]))

@@ -134,6 +134,7 @@ def test_rows_find_their_entries_by_numbers_and_write_them(fusion):
     both(fusion, function, numbers(5 * N, 3), numbers(N, 3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effects", [(), ("stribeck_friction", "drive_bandwidth", "other_delay", "joint_elasticity")])
 def test_a_drive_is_one_kernel_a_call_with_effects_too(fusion, effects):
     """As on a GPU: delays and effects count in tensors, and are reset by a mask."""

@@ -392,6 +392,7 @@ def test_a_written_configuration_is_the_one_that_the_file_stands_for(tmp_path, m
         new_robot()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("head", "body", "message"),
     [

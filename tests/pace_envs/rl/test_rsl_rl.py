@@ -203,6 +203,7 @@ def test_the_same_seed_trains_the_same_policy(run, tmp_path, no_export):
     assert all(torch.equal(first[name], second[name]) for name in first)
 
 
+@pytest.mark.slow
 def test_a_training_goes_on_where_it_stopped(run, no_export):
     before = torch.load(run / "model_1.pt", weights_only=False)
     assert before["infos"]["env"]["command_scale"] == {"base_velocity": 0.5}
@@ -212,6 +213,7 @@ def test_a_training_goes_on_where_it_stopped(run, no_export):
         resume(run)
 
 
+@pytest.mark.slow
 def test_a_training_with_other_options_starts_from_another_s_policy(run, tmp_path, monkeypatch):
     onnx = run / "exported" / "policy.onnx"  # another takes seconds
     monkeypatch.setattr(PaceOnPolicyRunner, "export_policy_to_onnx", lambda _, folder: shutil.copy(onnx, folder))

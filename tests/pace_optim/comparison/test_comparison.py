@@ -359,6 +359,7 @@ def test_white_noise_is_white_and_correlated_noise_is_not():
 # ---------------------------------------------------------------- load
 
 
+@pytest.mark.slow
 def test_the_load_torque_of_a_pendulum_is_its_equation():
     """τ = m l² q̈ + m g l sin q, of the stated load, at the joint's own position (encoder + bias)."""
     target = 0.6 * np.sin(2 * np.pi * 0.8 * np.arange(1201) * DT)[:, None]

@@ -118,6 +118,7 @@ def test_where_it_sits_is_there_for_each_recording(bench):
     assert [r["name"] for r in joint["recordings"]] == ["first", "again", "heavy"]
 
 
+@pytest.mark.slow
 def test_other_recordings_are_simulated_with_their_own_load(bench):
     run, files = bench
     content = compare([run], data=[files["other"], files["first"]])

@@ -66,6 +66,7 @@ def replay_score(recording, task: str, *, parameters=None, physics_dt=None, dela
 # --- replay
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", ["Pace-AnymalD-v0", "Pace-Go2-v0", "Pace-SO101-v0", "Pace-TestBench-v0"])
 def test_the_sample_recording_replays_exactly_with_the_true_parameters(task):
     cfg = pace_envs.load_env_cfg(task).sim2real
@@ -87,6 +88,7 @@ def test_the_sample_recording_of_anymal_is_the_reference_case():
         assert np.array_equal(values, np.full(12, expected))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay_mode", ["command", "effort"])
 @pytest.mark.parametrize("delay", [0.0, 2.4])
 @pytest.mark.parametrize("task", ["Pace-Go2-v0", "Pace-SO101-v0", "Pace-TestBench-v0"])
@@ -112,6 +114,7 @@ def test_the_joints_of_a_file_may_stand_in_another_order(suffix, tmp_path):
     assert replay_score(shuffled_recording, task) > 1e-7, "the true friction of one joint was changed"
 
 
+@pytest.mark.slow
 def test_gains_loads_and_physics_step_are_facts_of_the_replay(tmp_path):
     options = ("--stiffness", "60", "--damping", "1.5", "--load_mass", "2", "--load_length", "0.3", "--arm_mass", "0.4")
     recording = record(tmp_path, *BENCH, *SHORT, *options, "--physics_dt", "0.0005")
@@ -439,6 +442,7 @@ def cart(tmp_path_factory):
     return ("--task", str(path), *given, "--damping", "0.35", *SHORT)
 
 
+@pytest.mark.slow
 def test_a_drive_without_stiffness_is_told_speeds_and_moves(cart, tmp_path):
     """It was told positions, which it does not follow, and a recording of a robot at rest was written."""
     file = tmp_path / "told.csv"

@@ -130,6 +130,7 @@ def test_what_went_wrong_elsewhere_is_told_with_its_place(error):
     assert "in work_of_a_user" in told
 
 
+@pytest.mark.slow
 def test_a_process_ends_with_the_one_that_started_it(warm, tmp_path):
     """A result that nobody reads must not keep it."""
     script = tmp_path / "started.py"

@@ -419,6 +419,7 @@ def test_evolving_twice_on_the_same_scores_is_refused(bench):
         optimizer.evolve()
 
 
+@pytest.mark.slow
 def test_paces_rule_stops_the_search_and_says_so(longer):
     optimizer = run(longer, 8, 60, epsilon=0.8)
     spread = np.stack(optimizer.history)[:, :, 0]

@@ -54,6 +54,7 @@ def test_two_pendulums_are_found_together_with_the_delay_they_share(tmp_path):
     assert best.score <= 1e-14 and range_error(problem, best.x, PENDULUMS_TRUTH) < 1e-5
 
 
+@pytest.mark.slow
 def test_recordings_at_several_gains_are_refined_together():
     problem = make_problem([record(), record(drive={"stiffness": 40.0}), record(drive={"damping": 2.0})])
     best = refine(problem)[0]

@@ -158,6 +158,7 @@ def tip(q):
     return np.stack([-0.25 * np.sin(q), np.full_like(q, -0.3), 1.0 - 0.25 * np.cos(q)], axis=1)
 
 
+@pytest.mark.slow
 def test_an_end_effectors_pose_is_that_of_a_site_and_of_the_recording(tmp_path):
     cfg = pendulums_cfg(tmp_path)
     cfg.sim2real.ee_site = "left_tip"
@@ -294,6 +295,7 @@ def test_stop_rules_are_named_with_numbers():
             stop_rule(wrong)
 
 
+@pytest.mark.slow
 def test_a_stop_rule_of_the_command_ends_the_search(file, tmp_path):
     settings = FitSettings(
         task=BENCH, data=[str(file)], optimizer="cmaes", num_envs=16, stop=["early_stopping:generations=2"],

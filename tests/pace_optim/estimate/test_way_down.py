@@ -119,6 +119,7 @@ def test_a_way_that_had_left_pieces_goes_on_near_a_vector_on_the_whole(problem):
     assert end.stage == WHOLE and [each.stage for each in resumed.descents] == [PIECES, WHOLE]
 
 
+@pytest.mark.slow
 def test_a_way_that_is_resumed_is_the_one_that_was_interrupted(problem):
     seen = []
     staged = way(problem, on_iteration=lambda _: seen.append(checkpoint_of(staged.descents)))

@@ -244,6 +244,7 @@ def test_two_runs_in_the_same_second_have_folders_of_their_own(recordings, tmp_p
     assert len(folders) == 2
 
 
+@pytest.mark.slow
 def test_results_are_read_without_pickle(whole, monkeypatch):
     _, folder = whole("clean", optimizer="least_squares")
 
@@ -387,6 +388,7 @@ def test_a_resumed_search_may_be_given_more_generations(recordings, tmp_path, no
     assert same_result(resumed, whole)
 
 
+@pytest.mark.slow
 def test_a_recording_that_has_changed_is_not_resumed(recordings, tmp_path, no_report):
     copy = tmp_path / "copy.npz"
     save_recording(copy, record(name="copy"))
@@ -450,6 +452,7 @@ def test_a_step_that_takes_long_is_named_again():
     assert out.getvalue().startswith("reading  0 s")
 
 
+@pytest.mark.slow
 def test_a_fit_that_took_long_tells_its_result_before_it_is_checked(tmp_path, monkeypatch):
     told = io.StringIO()
     monkeypatch.setattr("pace_optim.identification.conclude._LONG", 0.0)

@@ -61,6 +61,7 @@ def legs():
     return SimpleNamespace(problem=problem, twins=twin_problem(problem, path), values=joint_vectors(problem, truth))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("training", [True, False])
 def test_they_move_as_they_do_among_all(legs, training):
     part, base = these(*CHOSEN), JointModel.base(legs.problem)

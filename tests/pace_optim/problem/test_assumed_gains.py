@@ -77,6 +77,7 @@ def test_gains_that_are_sought_are_no_warning(robot):
     assert ((ratio > 0.1) & (ratio < 10)).all()  # within reach of what is assumed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("commands", [("des_dof_effort",), ("des_dof_pos", "des_dof_effort")])
 def test_a_torque_that_is_commanded_is_all_that_moves_a_motor(robot, commands):
     problem = load_problem(str(robot), data=[recorded(robot, commands=commands)])

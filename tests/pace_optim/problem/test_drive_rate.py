@@ -37,6 +37,7 @@ def test_a_fast_loop_is_simulated_at_its_own_rate(tmp_path):
     assert error_at(fast, bench) < 0.2 * error_at(held, bench)
 
 
+@pytest.mark.slow
 def test_the_effect_explains_the_motion_of_a_drive_that_runs_continuously(tmp_path):
     bench = Bench(drive_dt=STEP, noise=0.0)
     path = record(tmp_path / "fast.csv", bench, position=chirp(1.0))

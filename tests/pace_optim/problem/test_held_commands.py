@@ -52,6 +52,7 @@ def test_one_step_per_control_step_does_not_lengthen_the_delay_of_the_bench(tmp_
     assert abs(best_delay(problem, bench)) < 0.1  # half a step before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0.005, 0.0061])
 def test_a_torque_held_over_a_control_step_is_simulated_to_the_noise(tmp_path, delay):
     """A light link on stiff gains, whose loop runs at the commands' rate, as of a file without gains."""

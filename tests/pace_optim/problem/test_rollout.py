@@ -91,6 +91,7 @@ def test_the_truth_replays_exactly_when_the_robots_own_order_is_not_the_models(t
     assert scores(problem, TWO) <= EXACT
 
 
+@pytest.mark.slow
 def test_a_finer_physics_step_replays_exactly_and_differs_from_the_coarse_one():
     fine = env_cfg()
     set_physics_dt(fine, DT / 5)
@@ -218,6 +219,7 @@ def test_a_diverging_candidate_leaves_the_others_as_they_were():
     assert float(again.max()) <= EXACT
 
 
+@pytest.mark.slow
 def test_several_drive_groups_replay_as_one():
     cfg = env_cfg("Pace-AnymalD-v0")
     (drive,) = cfg.scene.robot.actuators.values()

@@ -90,6 +90,7 @@ def with_backlash(walk):
     return problem, torch.cat([truth, torch.tensor(list(values.values())).double().repeat_interleave(8)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", [lambda walk: walk, with_backlash])
 def test_compiled_drives_move_as_the_environment_does(walk, robot, monkeypatch):
     problem, truth = robot(walk)
@@ -140,6 +141,7 @@ def test_the_encoder_of_a_joint_that_stands_shows_what_it_showed(walk, robot, ro
     assert bool((share > 0.1).all()) and bool((share < 0.9).all())
 
 
+@pytest.mark.slow
 def test_without_contacts_legs_are_in_the_air_while_their_torques_balance(walk, env):
     logged = walk[0].dataset.recordings[0]
     found = on_moving_base(replace(logged, contact=None, feet=()), env)
@@ -150,6 +152,7 @@ def test_without_contacts_legs_are_in_the_air_while_their_torques_balance(walk, 
         assert not (free & logged.contact[:, leg]).any()
 
 
+@pytest.mark.slow
 def test_legs_in_ropes_are_in_the_air_throughout(tmp_path):
     problem, _ = walking_problem(tmp_path, crawler(2, feet={}, swing=2.0), duration=0.8)
     assert bool(problem.dataset.carried.free[1:].all())

@@ -599,6 +599,7 @@ def test_a_hold_on_the_grid_keeps_the_area_of_the_hold():
     assert np.allclose(held.sum(axis=0) * 0.3, (values * np.maximum(until - time, 0.0)[:, None]).sum(axis=0))
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(
     rate=st.floats(60.0, 900.0),

@@ -48,6 +48,7 @@ def windows_of(dataset, recording):
     return [i for i, each in enumerate(dataset.recordings) if each is recording]
 
 
+@pytest.mark.slow
 def test_every_sample_is_in_one_window(bench):
     whole, cut = bench.twins.dataset, bench.twins.in_windows().dataset
     assert [len(windows_of(cut, recording)) for recording in whole.recordings] == [3, 2, 1]

@@ -115,6 +115,7 @@ def test_the_score_goes_on_where_the_search_ended():
     assert upper.get_xticklabels()[-1].get_text() == "12.7 M"  # 30 * 400k + 8 * 90k
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "history",
     [make_history(iterations=0), make_history(generations=0), History(), make_history(generations=1, iterations=0)],

@@ -62,6 +62,7 @@ def test_its_tags_are_balanced_and_its_ids_unique(page):
     assert len(page.ids) == len(set(page.ids))
 
 
+@pytest.mark.slow
 def test_what_a_run_says_is_escaped(tmp_path):
     folder = write_run(tmp_path / "run", make_result(warnings=[NASTY], notes=[NASTY], robot_name=NASTY, task=NASTY))
     content = make_trajectory()
@@ -88,6 +89,7 @@ def test_a_warning_s_table_keeps_its_columns(tmp_path):
     assert '<pre class="rows">joint  stated\nknee       30</pre><pre>&#34;effort_limit&#34;' in html
 
 
+@pytest.mark.slow
 def test_warnings_come_before_everything_else(tmp_path):
     text = page_of(write_run(tmp_path / "run", make_result(warnings=["friction of hip is at its upper bound"]))).text
     assert text.index("1 warning: read before") < text.index("Error of each joint") < text.index("Drag to zoom")
@@ -113,6 +115,7 @@ def test_without_validation_it_says_how_little_that_says(tmp_path):
     assert "Nothing was kept for validation" in text
 
 
+@pytest.mark.slow
 def test_sections_whose_files_are_missing_are_left_out(tmp_path):
     folder = write_run(tmp_path / "run")
     assert {"trajectories", "scores", "parameters"} <= set(page_of(folder).ids)
@@ -127,6 +130,7 @@ def test_a_folder_without_a_result_is_an_error(tmp_path):
         write_report(tmp_path)
 
 
+@pytest.mark.slow
 def test_recordings_that_disagree_are_shown(tmp_path):
     folder = write_run(tmp_path / "run")
     assert "consistency" not in page_of(folder).ids
@@ -292,6 +296,7 @@ def test_clicking_on_a_joint_s_error_shows_it(browser):
     assert browser.evaluate("document.querySelector('[data-choice=joint] input:checked').value") == "1"
 
 
+@pytest.mark.slow
 def test_the_score_can_be_seen_over_steps_and_time(browser):
     for label, last in (
         ("Simulated steps", 400_000 * 30 + 90_000 * 8),

@@ -67,6 +67,7 @@ COVERED |= {"free_form": [CURVE], "paying": ["stribeck_friction@knee|ankle", CUR
 COVERED["joints"]["hip"]["effects"] = ["torque_over_position"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("content", "run", "headline"),
     [
@@ -106,6 +107,7 @@ def test_the_headline_never_claims_more_than_the_verdict(tmp_path, content, run,
     assert ('class="callout bad"' not in write_report(folder).read_text("utf-8").partition("Error of each")[0]) == good
 
 
+@pytest.mark.slow
 def test_the_run_with_a_wrong_link_is_not_told_to_add_it(tmp_path):
     mass = {"parameter": "link_mass", "unit": "kg", "file": 0.5, "found": 0.8, "std": 0.01}
     wrong = [{"link": "shank", "parts": ["mass"], "values": [mass], "label": "shank@mass"}]

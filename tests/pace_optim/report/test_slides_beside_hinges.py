@@ -90,6 +90,7 @@ def test_the_fit_tells_each_in_its_unit(fitted):
     assert re.search(r"error, all joints: \S+ / \S+ mrad or mm \(train / validation\); score \S+ rad² or m²", said)
 
 
+@pytest.mark.slow
 def test_the_comparison_tells_each_in_its_unit(fitted):
     run, _ = fitted
     done = run_script("compare", run)

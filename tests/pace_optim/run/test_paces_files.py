@@ -61,6 +61,7 @@ def test_tensorboard_has_paces_tags(searched):
     assert first.value == pytest.approx(float(progress["scores_buffer"][0].min()), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_plot_needs_no_more_than_the_runs_folder(searched, tmp_path):
     done = run_script("plot_trajectory", str(searched), "--plot_trajectory", "--output", str(tmp_path), cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -221,6 +221,7 @@ def plain():
     return positions(Truth(base=BASE), CHIRP, COARSE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(EFFECTS))
 def test_every_effect_changes_the_motion_and_its_null_does_not(name, plain):
     drawn = draw_effect(name, ROBOT, np.random.default_rng(0))

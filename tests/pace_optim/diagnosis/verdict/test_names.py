@@ -186,6 +186,7 @@ def fitted_to(problem, *sizes, noise=0.3):
     return replace(now, jacobian=jacobian, error=error)
 
 
+@pytest.mark.slow
 def test_an_effect_whose_size_differs_between_recordings_is_seen(run):
     sizes = torch.tensor([1.0, 1.1, 0.9, 2.0])
     spring, friction = unevenness(fitted_to(run.problem, *sizes))[:, 0].tolist()

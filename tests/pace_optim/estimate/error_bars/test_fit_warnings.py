@@ -177,6 +177,7 @@ def test_commands_count_as_logged_too_rarely_where_a_delay_of_none_is_too_late(o
     assert not any("logged with the samples" in each for each in told)
 
 
+@pytest.mark.slow
 def test_a_fit_whose_truth_is_beyond_a_bound_is_told():
     problem = make_problem(record(truth={**TRUTH, "friction": 0.0}, noise=1e-4))
     x = normalised(problem, {**TRUTH, "friction": 0.0})

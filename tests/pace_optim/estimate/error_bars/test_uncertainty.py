@@ -245,6 +245,7 @@ def assessed(problem, x):
     return assess(problem, problem.evaluator(), x)
 
 
+@pytest.mark.slow
 def test_a_drive_that_is_off_hides_the_delay():
     off = np.zeros(401, dtype=bool)
     problem = make_problem(record(torque_enable=off, noise=1e-4))

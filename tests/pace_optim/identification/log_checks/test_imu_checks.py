@@ -23,10 +23,12 @@ def view(problem):
     return views_of(problem)[0]
 
 
+@pytest.mark.slow
 def test_nothing_is_wrong_with_an_imu_that_is_right(view):
     assert explained(view) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("matrix", "check", "words"),
     [
@@ -44,6 +46,7 @@ def test_an_imu_in_other_units_or_axes_is_found(view, matrix, check, words):
         raise ValueError(found.sentence)
 
 
+@pytest.mark.slow
 def test_an_imu_that_is_late_is_found_with_its_delay(view):
     steps = 3
     frame = np.concatenate([view.frame[:1].repeat(steps, axis=0), view.frame[:-steps]])

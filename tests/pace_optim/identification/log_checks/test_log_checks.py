@@ -144,6 +144,7 @@ def test_limits_of_a_slide_are_told_in_its_units(tmp_path):
     assert "stated [N]" in warning and "200 at stall, 0 at 2 m/s" in warning and "rad" not in warning
 
 
+@pytest.mark.slow
 def test_a_faulty_log_is_refused_before_the_search_unless_it_is_trusted(tmp_path):
     inputs.problem_of(inputs.make("swapped", 0), tmp_path)
     task = use_task(str(tmp_path / "robot.xml"))
@@ -155,11 +156,13 @@ def test_a_faulty_log_is_refused_before_the_search_unless_it_is_trusted(tmp_path
     assert "are swapped" in " ".join(problem.contradictions)
 
 
+@pytest.mark.slow
 def test_what_a_drive_does_otherwise_is_a_warning(tmp_path):
     problem = inputs.problem_of(inputs.make("limit", 0), tmp_path)
     assert "--unknown effort_limit" in " ".join(checked(problem).contradictions)
 
 
+@pytest.mark.slow
 def test_a_limit_that_the_motion_refutes_is_said_before_the_search(tmp_path):
     """Beside missing physics too: another joint carries a spring that the model does not have."""
     made = inputs.make("clean", 0)

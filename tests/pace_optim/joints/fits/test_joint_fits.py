@@ -207,6 +207,7 @@ def test_models_far_behind_are_left_at_the_coarse_step(bench):
     assert float(far.score.sqrt()) > 3 * float(near.score.sqrt())
 
 
+@pytest.mark.slow
 def test_far_from_the_truth_a_refit_also_starts_at_the_best_of_many_points(bench):
     heavy = bench.truth_values.clone()
     model = JointModel.base(bench.problem)
@@ -224,6 +225,7 @@ def test_far_from_the_truth_a_refit_also_starts_at_the_best_of_many_points(bench
     assert stiffness == {200, 500, 1500, 5000}  # the best base of each probe, whatever the others' errors are
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "value"), [("payload", 0.3), ("stribeck_friction", 1.0)])
 def test_joints_along_the_motion_of_a_robot_with_an_effect_move_as_it_does(bench, name, value):
     effect = get_effect(name)

@@ -44,6 +44,7 @@ def off(bench, fitted):
     return float((fitted.model.to_physical(fitted.x) / bench.truth_values - 1).abs().max())
 
 
+@pytest.mark.slow
 def test_a_window_that_swings_by_itself_does_not_lead_the_fit_astray(bench):
     with_all = FITS.over_wide_steps(bench.swinging, away(bench))
     trimmed = FITS.trimmed(bench.swinging, with_all, ALL)

@@ -93,6 +93,7 @@ def test_every_effect_moves_a_joint_as_in_the_simulation(kernels, bench):
     assert max(apart.values()) < 1e-8, apart
 
 
+@pytest.mark.slow
 def test_several_joints_recordings_and_effects_at_once(kernels, legs):
     sets = (["payload"], ["com_offset", "backlash"], ["measurement_delay", "stribeck_friction", "torque_gain"])
     models = slots_of(legs.problem, legs.start, *([get_effect(name) for name in names] for names in sets))

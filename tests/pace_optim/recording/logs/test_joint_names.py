@@ -57,6 +57,7 @@ def read_back(path, names, robot):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_robot", [False, True])
 @pytest.mark.parametrize("form", [("{}_pos", "{}_cmd"), ("observation.state[{}.pos]", "action[{}.pos]")])
 def test_columns_of_a_joint_are_read_under_its_name(tmp_path, monkeypatch, form, with_robot):
@@ -68,6 +69,7 @@ def test_columns_of_a_joint_are_read_under_its_name(tmp_path, monkeypatch, form,
         read_back(path, [name], Robot(joint_names=(name,)) if with_robot else Robot())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_robot", [False, True])
 def test_columns_of_all_joints_of_a_log_are_read_under_their_names(tmp_path, monkeypatch, with_robot):
     monkeypatch.chdir(tmp_path)

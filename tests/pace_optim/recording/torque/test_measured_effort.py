@@ -134,6 +134,7 @@ def test_feed_forward_is_read_and_simulated_as_the_drive_takes_it():
     assert taken.command_effort == pytest.approx(law.feed_forward * recording.command_effort)
 
 
+@pytest.mark.slow
 def test_a_feed_forward_in_one_recording_of_two_is_read():
     several = replace(recorded(feed_forward=0.5), name="a"), replace(recorded(seconds=6.0), name="b")
     for order in (several, several[::-1]):

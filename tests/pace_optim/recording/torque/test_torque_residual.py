@@ -165,6 +165,7 @@ def test_gains_and_what_a_sensor_adds_are_found_beside_the_drive(run):
     assert any("follows dof_effort of servo" in note for note in result.notes)
 
 
+@pytest.mark.slow
 def test_a_run_is_opened_with_the_noise_that_its_torques_had(run):
     result, folder = run
     problem = open_problem(folder)
@@ -206,6 +207,7 @@ def test_a_filtered_torque_does_not_spoil_a_fit(tmp_path):
     assert result.torque_noise["servo"] > 0.05
 
 
+@pytest.mark.slow
 def test_torques_that_say_nothing_are_left_out_and_told(tmp_path):
     told = np.sin(np.arange(1600) / 40)
     log = record(tmp_path / "log.csv", Bench(), position=chirp(4.0), effort=told, sensor=lambda _: told)
@@ -217,6 +219,7 @@ def test_torques_that_say_nothing_are_left_out_and_told(tmp_path):
         load_problem(TASK, data=[log], residual=BOTH)
 
 
+@pytest.mark.slow
 def test_a_limit_that_a_torque_shows_is_refined(tmp_path):
     log = record(tmp_path / "log.csv", Bench(current_limit=8.0), position=chirp(4.0), sensor=sensed)
     facts = json.loads(log.with_suffix(".json").read_text())
