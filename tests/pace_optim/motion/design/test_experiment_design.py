@@ -109,10 +109,10 @@ def test_each_limit_binds():
     assert weak.joints == (None,)  # every candidate needs more torque than there is
 
 
-@pytest.mark.slow
-def test_each_tree_takes_its_own_best(tmp_path):
+def two_pendulums(tmp_path, scale):
+    """Configuration, limits and truth of two pendulums that swing by a scale each."""
     cfg = pendulums_cfg(tmp_path)
-    cfg.sim2real.excitation = ExcitationCfg(bias=(0.0, 0.0), direction=(1.0, 1.0), scale=(0.3, 0.3))
+    cfg.sim2real.excitation = ExcitationCfg(bias=(0.0, 0.0), direction=(1.0, 1.0), scale=scale)
     limits = MotionLimits(
         joint_names=("left", "right"),
         position=np.tile([-np.inf, np.inf], (2, 1)),
@@ -120,6 +120,12 @@ def test_each_tree_takes_its_own_best(tmp_path):
         effort=np.full(2, 50.0),
     )
     truth = {"armature": 0.1, "viscous_friction": 2.0, "friction": 0.3, "encoder_bias": 0.01, "delay": 2.6}
+    return cfg, limits, truth
+
+
+@pytest.mark.slow
+def test_each_tree_takes_its_own_best(tmp_path):
+    cfg, limits, truth = two_pendulums(tmp_path, scale=(0.3, 0.3))
     settings = replace(SMALL, reach=1.5)
     chosen = design(cfg, limits, truth=truth, settings=settings)
     assert chosen.criterion_after < chosen.criterion_before
@@ -129,15 +135,7 @@ def test_each_tree_takes_its_own_best(tmp_path):
 
 @pytest.mark.slow
 def test_a_joint_without_amplitude_rests_while_the_other_is_optimised(tmp_path):
-    cfg = pendulums_cfg(tmp_path)
-    cfg.sim2real.excitation = ExcitationCfg(bias=(0.0, 0.0), direction=(1.0, 1.0), scale=(0.3, 0.0))
-    limits = MotionLimits(
-        joint_names=("left", "right"),
-        position=np.tile([-np.inf, np.inf], (2, 1)),
-        velocity=np.full(2, 9.0),
-        effort=np.full(2, 50.0),
-    )
-    truth = {"armature": 0.1, "viscous_friction": 2.0, "friction": 0.3, "encoder_bias": 0.01, "delay": 2.6}
+    cfg, limits, truth = two_pendulums(tmp_path, scale=(0.3, 0.0))
     chosen = design(cfg, limits, truth=truth, settings=replace(SMALL, reach=1.5))
     assert np.ptp(chosen.trajectory.des_dof_pos[:, 1]) == 0.0 < np.ptp(chosen.trajectory.des_dof_pos[:, 0])
 
